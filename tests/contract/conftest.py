@@ -187,7 +187,7 @@ def service(data_dir, run_job=None, **settings):
         from tests.fleet.running import running  # noqa: PLC0415 - Ray is an extra
 
         with (
-            running(small_settings(data_dir, **settings), run_job=InThisProcess(data_dir)) as fleet,
+            running(small_settings(data_dir, **settings), make_run_job=InThisProcess) as fleet,
             FleetClient(base_url=fleet.url, timeout=120, follow_redirects=True) as client,
         ):
             yield client

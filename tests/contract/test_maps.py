@@ -404,4 +404,4 @@ def test_a_camera_that_cannot_serve_is_named(client, yard):
     assert (code, "encodings of 16 numbers, not of 9" in says) == ("invalid_encoding", True)
     assert client.delete("/v1/admin/domains/short").status_code == 204
     assert client.delete("/v1/admin/domains/yard/traverses/winter").status_code == 204
-    assert "made of traverse winter, which is gone" in why(camera_of="yard")[1]
+    assert "made of traverse winter, which is not in this data directory" in why(camera_of="yard")[1]

@@ -84,16 +84,15 @@ from deepsimbad.api import server
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.settings import Settings
 data_dir = Path(sys.argv[1])
-# A hundred processes for a hundred tiny jobs would only take the time of the requests.
-run_job = InThisProcess(data_dir)
+# Jobs in this process: a hundred processes for a hundred tiny jobs would only take the time of the requests.
 settings = Settings(data_dir=data_dir, port=int(sys.argv[-1]), event_poll_s=0.01, rate_limit_per_s=0)
 if "TEST_FLEET" in os.environ:
     from tests.fleet.running import application, cluster
     cluster()
-    application.start(settings.model_copy(update={"map_store": f"file://{data_dir}-store"}), 2, run_job)
+    application.start(settings.model_copy(update={"map_store": f"file://{data_dir}-store"}), 2, InThisProcess)
     application.wait()
 else:
-    server.create_app = partial(server.create_app, run_job=run_job)
+    server.create_app = partial(server.create_app, run_job=InThisProcess(data_dir))
     server.serve(settings)
 """
 

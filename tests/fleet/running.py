@@ -58,7 +58,7 @@ class Fleet:
 
 
 @contextmanager
-def running(settings: Settings, n_replicas=2, run_job=None):
+def running(settings: Settings, n_replicas=2, make_run_job=None, n_administrators=1):
     """A fleet that answers, and is gone behind the block."""
     name = next(_names)
     store = settings.map_store or f"file://{settings.data_dir}-store"
@@ -66,7 +66,8 @@ def running(settings: Settings, n_replicas=2, run_job=None):
     try:
         with warnings.catch_warnings(action="ignore"):
             cluster()
-            front = application.start(settings, n_replicas, run_job, name, application.Encoders(1))
+            encoders = application.Encoders(1)
+            front = application.start(settings, n_replicas, make_run_job, name, encoders, n_administrators)
             address = front.address.remote().result()
         yield Fleet(name, address)
     finally:

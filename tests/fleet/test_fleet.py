@@ -49,7 +49,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory):
     data_dir = tmp_path_factory.mktemp("fleet") / "data"
-    with running(small_settings(data_dir), run_job=InThisProcess(data_dir)) as fleet:
+    with running(small_settings(data_dir), make_run_job=InThisProcess) as fleet:
         yield fleet
 
 
@@ -221,7 +221,7 @@ def test_keys_count_everywhere(tmp_path):
         _, admin = catalog.create_key(KeyScope.ADMIN)
         record, robot = catalog.create_key(KeyScope.LOCALIZE, domains=["mine"])
     with (
-        running(small_settings(data_dir, root_path="/robots"), run_job=InThisProcess(data_dir)) as fleet,
+        running(small_settings(data_dir, root_path="/robots"), make_run_job=InThisProcess) as fleet,
         Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": admin.text}) as operator,
         Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": robot.text}) as own,
     ):

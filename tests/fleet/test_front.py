@@ -1,6 +1,7 @@
 """What the front makes of many answers, and of none."""
 
 import asyncio
+import json
 import warnings
 from http import HTTPStatus
 
@@ -10,6 +11,7 @@ pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=I
 
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
     from deepsimbad.fleet import front
+    from deepsimbad.fleet.administrators import Administrators
     from deepsimbad.fleet.backend import Backend, Gone
     from deepsimbad.fleet.front import Front, added_up
 
@@ -50,7 +52,8 @@ class Away(Backend):
 def test_who_asks_while_both_owners_are_away_waits_a_while_with_one_key(monkeypatch, patience_s, status):
     monkeypatch.setattr(front, "_PATIENCE_S", patience_s)
     asked = Front.__new__(Front)
-    asked._admin, asked._replicas = Away(), [Away(), Away()]
+    admin = Away()
+    asked._administrators, asked._replicas = Administrators([admin]), [Away(), Away()]
     path = f"/v1/sessions/{'0' * 32}/observations"
     scope = {"type": "http", "method": "POST", "path": path, "headers": [], "query_string": b""}
     sent = []
@@ -64,4 +67,63 @@ def test_who_asks_while_both_owners_are_away_waits_a_while_with_one_key(monkeypa
     assert len(calls) == (3 if patience_s else 2)
     assert {body for _, body in calls} == {b"view"}
     assert len({key for key, _ in calls}) == 1
-    assert asked._admin.asked == []
+    assert admin.asked == []
+
+
+class Administering(Backend):
+    """One that administers, with what it answers; None: it is away."""
+
+    def __init__(self, status=HTTPStatus.OK, body=None):
+        super().__init__(None)
+        self.status, self.body = status, body
+
+    async def ask(self, method, *arguments):
+        if self.body is None:
+            raise Gone
+        start = {"type": "http.response.start", "status": self.status, "headers": [(b"x-request-id", b"a")]}
+        return [start, {"type": "http.response.body", "body": self.body}]
+
+
+def answered(path, *administering):
+    """The status and body of the front's answer where these administer."""
+    asked = Front.__new__(Front)
+    asked._administrators, asked._replicas = Administrators(administering), []
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "http", "method": "GET", "path": path, "headers": [], "query_string": b""}
+    asyncio.run(asked._pass_on(scope, b"", lambda: asyncio.sleep(120), send))
+    headers, body = sent[0]["headers"], b"".join(message.get("body", b"") for message in sent[1:])
+    assert (b"x-request-id" in dict(headers)) == (path == "/readyz")
+    assert [value for name, value in headers if name == b"content-length"] in ([], [str(len(body)).encode()])
+    return sent[0]["status"], body.decode()
+
+
+def ready(*damaged):
+    return Administering(body=json.dumps({"status": "ready", "damaged_maps": damaged}).encode())
+
+
+def test_a_fleet_is_ready_when_all_that_administer_are():
+    status, body = answered("/readyz", ready("b"), ready("a", "b"))
+    assert (status, json.loads(body)) == (200, {"status": "ready", "damaged_maps": ["a", "b"]})
+    full = Administering(HTTPStatus.SERVICE_UNAVAILABLE, b"the disk is full")
+    assert answered("/readyz", ready(), full) == (503, "the disk is full")
+    for pair in ((ready(), Administering()), (Administering(), full)):
+        status, body = answered("/readyz", *pair)
+        assert (status, json.loads(body)["code"]) == (503, "unavailable")
+
+
+def health(is_ready, n_free, n_jobs):
+    gauges = {"ready": is_ready, "data_dir_free_bytes": n_free, "data_dir_size_bytes": 100.0, "jobs": n_jobs}
+    return "".join(f"# TYPE deepsimbad_{name} gauge\ndeepsimbad_{name} {value}\n" for name, value in gauges.items())
+
+
+def test_of_several_that_administer_the_disk_and_readiness_of_the_worst_are_told():
+    fine, full, broken = (
+        Administering(body=health(*told).encode()) for told in ((1.0, 90.0, 1.0), (1.0, 2.0, 2.0), (0.0, 50.0, 4.0))
+    )
+    assert answered("/metrics", fine, full) == (200, health(1.0, 2.0, 3.0))
+    assert answered("/metrics", fine, broken) == (200, health(0.0, 50.0, 5.0))
+    assert answered("/metrics", Administering(), fine) == (200, health(1.0, 90.0, 1.0))

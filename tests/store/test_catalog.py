@@ -192,6 +192,21 @@ def test_the_life_of_a_job(campus: Catalog) -> None:
     assert campus.jobs("campus") == campus.jobs()
 
 
+def test_jobs_of_two_catalogs_are_one_list_in_the_order_of_their_making(
+    campus: Catalog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Catalog.open(tmp_path / "other") as other:
+        other.create_domain("city", EVALUATOR, False, [1])
+        made = []
+        for catalog, domain in 2 * [(campus, "campus"), (other, "city")]:
+            made.append(catalog.create_job(domain, "remap", {}).job_id)
+        both = [*campus.numbered_jobs(None, None, 9), *other.numbered_jobs(None, None, 9)]
+        assert [job.job_id for _, job in sorted(both, key=lambda entry: entry[0])] == made
+    monkeypatch.setattr("time.time", lambda: 0.0)  # a clock that was set back
+    last = campus.create_job("campus", "remap", {}).job_id
+    assert campus.newest_jobs(None, None, 1).records[0].job_id == campus.waiting_jobs()[-1] == last
+
+
 def test_a_catalog_that_cannot_be_used_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(UnavailableError) as caught:

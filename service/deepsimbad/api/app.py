@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import TimeoutError as TookTooLong
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -59,7 +60,7 @@ from deepsimbad.release import release
 from deepsimbad.settings import MEBIBYTE, Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import service_lock
-from deepsimbad.store.records import KeyRecord
+from deepsimbad.store.records import JobRecord, KeyRecord, ListPage
 from deepsimbad.store.sessions import SessionRecord, SessionStore
 from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
 
@@ -90,6 +91,9 @@ class Elsewhere:
     # Opens those of a data directory, told whom to tell of every transaction
     sessions: Callable[[Path, Callable[[int], None]], SessionStore] = SessionStore.open
     owners: Owners | None = None  # of domains, where one view is asked of many
+    administrator: int = 0  # which of several that administer this is, each with domains of its own
+    # A page of the jobs of a catalog and of others, as `Catalog.newest_jobs`
+    newest_jobs: Callable[[Catalog, str | None, int | None, int], ListPage[JobRecord, int]] = Catalog.newest_jobs
     make_evaluator: Callable[[EvaluatorConfig, Compute | None], Evaluator] = make_evaluator
 
 
@@ -263,6 +267,7 @@ def _start(
     )
     parts.callback(live.close)
     if isinstance(catalog, SharedCatalog):
+        catalog.administrator = elsewhere.administrator
         catalog.is_in_use = lambda domain, version, digest: (
             maps_.holds(domain, version, digest) or (domain, version) in SessionStore.pins(store)  # of those read here
         )
@@ -318,6 +323,7 @@ def _start(
         uploads=Slots(settings.max_uploads, "batches of frames are on their way", "max_uploads"),
         event_streams=Slots(settings.max_event_streams, "event streams are open", "max_event_streams"),
         owners=elsewhere.owners,
+        newest_jobs=partial(elsewhere.newest_jobs, catalog),
     )
 
 

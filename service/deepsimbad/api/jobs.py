@@ -255,7 +255,7 @@ async def room_for_a_stream(running: Running) -> AsyncIterator[None]:
 @router.get("", responses=problems(404, 422))
 async def list_jobs(running: Running, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None) -> JobList:
     """Jobs, newest first."""
-    newest = await run_sync(running.catalog.newest_jobs, domain, page.number, page.limit)
+    newest = await run_sync(running.newest_jobs, domain, page.number, page.limit)
     return JobList.model_validate({"jobs": newest.records, "next": page.next(newest.last_key)})
 
 

@@ -45,7 +45,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.records import KeyScope
+from deepsimbad.store.records import JobRecord, KeyScope, ListPage
 from deepsimbad.store.sessions import SessionStore
 
 T = TypeVar("T")
@@ -116,6 +116,7 @@ class Services:
     Attributes:
         faults: What keeps the service from being ready, a sentence each; may wait for the disk.
         stopping: Set when shutdown begins; streams end on it.
+        newest_jobs: As `Catalog.newest_jobs`, of all catalogs that one answers for.
         owners: Who has the domains where one view is asked of many; None: `atlas` does.
         spools: How much waits to be fitted, and may.
         batches: The thread that reads batches into memory.
@@ -144,6 +145,7 @@ class Services:
     faults: Callable[[], tuple[str, ...]]
     uploads: Slots
     event_streams: Slots
+    newest_jobs: Callable[[str | None, int | None, int], ListPage[JobRecord, int]]
     owners: Owners | None = None
     stopping: threading.Event = field(default_factory=threading.Event)
     batches: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))

@@ -89,6 +89,13 @@ def map_on_ray(
     "--replicas", type=click.IntRange(min=1), default=4, show_default=True, help="Processes that have domains."
 )
 @click.option(
+    "--administrators",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Processes that take uploads and do jobs, each those of its domains.",
+)
+@click.option(
     "--encoders",
     type=click.IntRange(min=0),
     help="Processes that have the networks for all; 0: each replica its own.  [default: 1 with --encoder-gpus, else 0]",
@@ -102,7 +109,13 @@ def map_on_ray(
 )
 @_address_option
 def serve(
-    host: str | None, port: int | None, replicas: int, encoders: int | None, encoder_gpus: float, address: str | None
+    host: str | None,
+    port: int | None,
+    replicas: int,
+    administrators: int,
+    encoders: int | None,
+    encoder_gpus: float,
+    address: str | None,
 ) -> None:
     """Serve the domains of a map store from a cluster until interrupted; the data directory is for uploads and jobs."""
     settings = given_settings(host=host, port=port)
@@ -112,6 +125,7 @@ def serve(
 
     os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
     joined(address)
-    front = application.start(settings, replicas, encoders=application.Encoders(encoders, encoder_gpus))
+    of_networks = application.Encoders(encoders, encoder_gpus)
+    front = application.start(settings, replicas, encoders=of_networks, n_administrators=administrators)
     click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
     application.wait()

@@ -18,7 +18,7 @@ _TIMEOUT_S = 5.0
 
 
 class AllSessions(SharedSessionStore):
-    """The sessions as the one that administers sees them: it looks after none, and lists them all."""
+    """The sessions as one that administers sees them: it looks after none, and lists them all."""
 
     replicas: Sequence[DeploymentHandle[Any]] = ()
 

@@ -1,4 +1,4 @@
-"""The fleet as an application of Ray Serve: one that administers, replicas that have the domains, the front."""
+"""The fleet as an application of Ray Serve: those that administer, replicas that have the domains, the front."""
 
 import signal
 from dataclasses import dataclass
@@ -11,8 +11,7 @@ from ray.serve.schema import LoggingConfig
 from deepsimbad.errors import SettingsError
 from deepsimbad.fleet.encoder import Encoder
 from deepsimbad.fleet.front import Front
-from deepsimbad.fleet.replica import Replica, replica_name
-from deepsimbad.jobs.runner import RunJob
+from deepsimbad.fleet.replica import MakeRunJob, Replica, administrator_name, replica_name
 from deepsimbad.settings import Settings, trace_settings
 
 NAME = "deepsimbad"
@@ -41,9 +40,21 @@ class Encoders:
 
 
 def build(
-    settings: Settings, n_replicas: int, run_job: RunJob | None = None, encoders: Encoders = Encoders()
+    settings: Settings,
+    n_replicas: int,
+    make_run_job: MakeRunJob | None = None,
+    encoders: Encoders = Encoders(),
+    n_administrators: int = 1,
 ) -> serve.Application:
-    """What `serve.run` takes; every part is restarted where its process ends."""
+    """What `serve.run` takes; every part is restarted where its process ends.
+
+    Args:
+        settings: As `Replica`.
+        n_replicas: Processes that have domains.
+        make_run_job: As `Replica`.
+        encoders: Processes that have networks.
+        n_administrators: Processes that administer, each some of the domains.
+    """
     if settings.map_store is None:
         raise SettingsError(
             "a fleet shares maps and sessions in a map store: name one with --map-store, as s3://bucket/prefix or, on "
@@ -56,24 +67,28 @@ def build(
         takes = {**_EACH["ray_actor_options"], "num_gpus": encoders.num_gpus}
         of_networks = {**_EACH, "num_replicas": encoders.number, "ray_actor_options": takes}
         encoder = serve.deployment(**of_networks)(Encoder).options(name="encoder").bind(settings)
-    admin = whole.options(name="admin").bind(settings, n_replicas, encoder, None, run_job)
-    replicas = [
-        whole.options(name=replica_name(number)).bind(settings, n_replicas, encoder, admin)
-        for number in range(n_replicas)
+    given = settings, n_replicas, n_administrators, encoder
+    admin = whole.options(name=administrator_name(0)).bind(*given, None, 0, make_run_job)
+    others = [
+        whole.options(name=administrator_name(number)).bind(*given, admin, number, make_run_job)
+        for number in range(1, n_administrators)
     ]
-    return serve.deployment(**_EACH)(Front).options(name="front").bind(settings, admin, *replicas)
+    replicas = [whole.options(name=replica_name(number)).bind(*given, admin) for number in range(n_replicas)]
+    return serve.deployment(**_EACH)(Front).options(name="front").bind(settings, [admin, *others], replicas)
 
 
 def start(
     settings: Settings,
     n_replicas: int,
-    run_job: RunJob | None = None,
+    make_run_job: MakeRunJob | None = None,
     name: str = NAME,
     encoders: Encoders = Encoders(),
+    n_administrators: int = 1,
 ) -> DeploymentHandle[Front]:
     """Start the fleet in the cluster that this process has joined; returns when it answers."""
     serve.start(proxy_location="Disabled")  # the front listens itself
-    return serve.run(build(settings, n_replicas, run_job, encoders), name=name, route_prefix=None)
+    fleet = build(settings, n_replicas, make_run_job, encoders, n_administrators)
+    return serve.run(fleet, name=name, route_prefix=None)
 
 
 def wait() -> None:
@@ -86,7 +101,8 @@ def wait() -> None:
 
 
 def from_yaml(arguments: dict[str, Any]) -> serve.Application:
-    """What `serve deploy serve.yaml` asks for: `replicas`, `encoders`, `encoder_gpus`, any setting by its name."""
-    n_replicas = int(arguments.pop("replicas", 4))
+    """What `serve deploy serve.yaml` asks for: the options of `deepsimbad ray serve`, any setting by its name."""
+    n_replicas, n_administrators = int(arguments.pop("replicas", 4)), int(arguments.pop("administrators", 1))
     encoders = Encoders(arguments.pop("encoders", None), float(arguments.pop("encoder_gpus", 0.0)))
-    return build(trace_settings(**arguments).settings, n_replicas, encoders=encoders)
+    settings = trace_settings(**arguments).settings
+    return build(settings, n_replicas, encoders=encoders, n_administrators=n_administrators)

@@ -1,6 +1,8 @@
-"""The front of the fleet: an HTTP server that gives every request to a replica that has its domain."""
+"""The front of the fleet: an HTTP server that gives every request to a process that has its domain."""
 
 import asyncio
+import json
+import re
 import secrets
 import socket
 from collections.abc import Iterable, Sequence
@@ -14,10 +16,11 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from deepsimbad.api.keys import KeyRing, presented_key
+from deepsimbad.api.keys import KeyRing, needed_scope, presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
 from deepsimbad.errors import DeepSimbadError, UnauthorizedError, UnavailableError
+from deepsimbad.fleet.administrators import Administrators
 from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
 from deepsimbad.fleet.bodies import Bodies
 from deepsimbad.fleet.placement import place
@@ -38,7 +41,12 @@ _OF_EACH = {  # gauges
     "loaded_map_bytes",
     "sessions",
     "map_store_failing",
+    "jobs",
 }
+_OF_WORST = re.compile(
+    r"^deepsimbad_(?:ready (?P<ready>\S+)|data_dir_free_bytes (?P<free>\S+)|data_dir_size_bytes (?P<size>\S+))$",
+    re.MULTILINE,
+)
 
 
 class Front:
@@ -49,18 +57,21 @@ class Front:
     """
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
-        self, settings: Settings, admin: DeploymentHandle[Replica], *replicas: DeploymentHandle[Replica]
+        self,
+        settings: Settings,
+        administrators: Sequence[DeploymentHandle[Replica]],
+        replicas: Sequence[DeploymentHandle[Replica]],
     ) -> None:
         configure_logging(settings.log_level)
         self._settings = settings
-        self._admin = Backend(admin)
+        self._administrators = Administrators([Backend(handle) for handle in administrators])
         self._replicas = [Backend(handle) for handle in replicas]
-        backends = [self._admin, *self._replicas]
+        backends = [*self._administrators.backends, *self._replicas]
         self._watching = [asyncio.create_task(backend.watch()) for backend in backends]
         while any(backend.gone is None for backend in backends):
             await asyncio.sleep(0.05)
         self._keys = KeyRing()
-        await asyncio.to_thread(self._keys.load, keys_of(admin))
+        await asyncio.to_thread(self._keys.load, keys_of(administrators[0]))
         self._bodies = Bodies(settings, self._keys)
         self._watching.append(asyncio.create_task(self._keys.follow()))
         try:
@@ -117,8 +128,14 @@ class Front:
         if scope["path"] == "/metrics":
             await self._metrics(scope, receive, send)
             return
-        who = self._who(scope)
-        patience_s = 0.0 if who == [self._admin] else _PATIENCE_S  # who asks for health is told at once
+        if scope["path"] == "/readyz" and len(self._administrators.backends) > 1:
+            await self._readiness(scope, receive, send)
+            return
+        try:
+            who, patience_s = await self._who(scope)
+        except UnavailableError as error:
+            await _refuse(scope, error, receive, send)
+            return
         until = asyncio.get_running_loop().time() + patience_s
         while not await self._is_answered(who, scope, body, send):
             if asyncio.get_running_loop().time() >= until:
@@ -153,31 +170,67 @@ class Front:
 
     async def _metrics(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The counts of all that are there."""
-        asked = (backend.ask("ask", scope, b"") for backend in (self._admin, *self._replicas))
-        answers = [
-            answer for answer in await asyncio.gather(*asked, return_exceptions=True) if isinstance(answer, list)
-        ]
-        for answer in answers:
-            if answer[0]["status"] != HTTPStatus.OK:
-                for message in answer:
-                    await send(message)
-                return
-        texts = [b"".join(message.get("body", b"") for message in answer).decode() for answer in answers]
+        administering = await self._asked(self._administrators.backends, scope)
+        answers = administering + await self._asked(self._replicas, scope)
+        if (refusal := _refusal(answers)) is not None:
+            for message in refusal:
+                await send(message)
+            return
+        texts = [_body(answer).decode() for answer in answers]
+        texts[: len(administering)] = sorted(texts[: len(administering)], key=_health)  # who is worst off is believed
         await Response(added_up(texts), media_type=CONTENT_TYPE_LATEST)(scope, receive, send)
 
-    async def _before_last(self, message: Message, backend: Backend) -> None:
-        """Before an answer of the one that administers is whole, let the replicas see what it may have changed."""
-        if backend is self._admin and message["type"] == "http.response.body" and not message.get("more_body", False):
-            await asyncio.gather(*(replica.ask("follow") for replica in self._replicas), return_exceptions=True)
+    async def _readiness(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Whether all that administer are ready, and the damaged maps that any of them has met."""
+        answers = await self._asked(self._administrators.backends, scope)
+        if len(answers) < len(self._administrators.backends):
+            what = "one of those that administer is away this moment"
+            await _refuse(scope, UnavailableError(what, retry_after_s=AWAY_S, faults=[what]), receive, send)
+            return
+        if scope["method"] == "GET" and _refusal(answers) is None:
+            documents = [json.loads(_body(answer)) for answer in answers]
+            damaged = sorted({domain for document in documents for domain in document["damaged_maps"]})
+            body = json.dumps({**documents[0], "damaged_maps": damaged}).encode()
+            headers = [(name, value) for name, value in answers[0][0]["headers"] if name != b"content-length"]
+            headers.append((b"content-length", str(len(body)).encode()))
+            await send({**answers[0][0], "headers": headers})
+            await send({"type": "http.response.body", "body": body})
+            return
+        for message in _refusal(answers) or answers[0]:
+            await send(message)
 
-    def _who(self, scope: Scope) -> Sequence[Backend]:
-        """Who may answer, the better one first."""
+    async def _asked(self, backends: Sequence[Backend], scope: Scope) -> list[list[Message]]:
+        """The answers of those that are there."""
+        asked = (backend.ask("ask", scope, b"") for backend in backends)
+        return [answer for answer in await asyncio.gather(*asked, return_exceptions=True) if isinstance(answer, list)]
+
+    async def _before_last(self, message: Message, backend: Backend) -> None:
+        """Before an answer of one that administers is whole, let all others see what it may have changed."""
+        administering = self._administrators.backends
+        if backend in administering and message["type"] == "http.response.body" and not message.get("more_body", False):
+            others = [each for each in (*administering, *self._replicas) if each is not backend]
+            await asyncio.gather(*(other.ask("follow") for other in others), return_exceptions=True)
+
+    async def _who(self, scope: Scope) -> tuple[Sequence[Backend], float]:
+        """Who may answer, the better one first, and how many seconds it may be waited for; raises UnavailableError."""
         word = dict(scope["headers"]).get(b"idempotency-key")
         placed = place(scope["path"], len(self._replicas), _key_id(scope), word and word.decode("latin-1"))
-        if placed is None:
-            return [self._admin]
+        if placed is None:  # who asks for health is told at once
+            if not self._opens(scope):  # and learns nothing of domains
+                return self._administrators.backends, 0.0
+            return await self._administrators.of(scope["path"], scope["query_string"]), 0.0
         backends = [self._replicas[number] for number in placed[0]]
-        return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls)
+        return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls), _PATIENCE_S
+
+    def _opens(self, scope: Scope) -> bool:
+        """Whether the key that is presented, if one is asked, has the scope that is needed."""
+        needed = needed_scope(scope["path"])
+        try:
+            return (
+                needed is None or self._keys.is_open or self._keys.holder(presented_key(scope)).scope.includes(needed)
+            )
+        except (UnauthorizedError, UnavailableError):  # whoever is asked says so
+            return False
 
 
 async def _refuse(scope: Scope, error: DeepSimbadError, receive: Receive, send: Send) -> None:
@@ -191,6 +244,23 @@ async def _refuse(scope: Scope, error: DeepSimbadError, receive: Receive, send: 
         await send(message)
 
     await error_response(scope, error)(scope, receive, send_marked)
+
+
+def _refusal(answers: Iterable[list[Message]]) -> list[Message] | None:
+    """The first answer that is none."""
+    return next((answer for answer in answers if answer[0]["status"] != HTTPStatus.OK), None)
+
+
+def _body(answer: Iterable[Message]) -> bytes:
+    return b"".join(message.get("body", b"") for message in answer)
+
+
+def _health(text: str) -> tuple[float, float]:
+    """Whether one that administers is ready, and the share of its disk that is free, as it tells Prometheus."""
+    told = {
+        name: float(value) for found in _OF_WORST.finditer(text) for name, value in found.groupdict().items() if value
+    }
+    return told.get("ready", 0.0), told.get("free", 0.0) / told.get("size", 1.0)
 
 
 def _key_id(scope: Scope) -> str | None:

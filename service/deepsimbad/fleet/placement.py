@@ -34,7 +34,7 @@ def session_owners(session_id: str, n_replicas: int) -> tuple[int, ...]:
 def place(
     path: str, n_replicas: int, key_id: str | None = None, word: str | None = None
 ) -> tuple[tuple[int, ...], bool] | None:
-    """Who answers a decoded path, and whether in this order; None: the one that administers all domains.
+    """Who answers a decoded path, and whether in this order; None: one that administers.
 
     Args:
         path: As it is routed.

@@ -7,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, aclosing, suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, TypeAlias, cast
 
 from ray import serve
 from ray.serve.handle import DeploymentHandle
@@ -23,7 +24,8 @@ from deepsimbad.engine.distant import by_encoder
 from deepsimbad.engine.localizer import Localization, View
 from deepsimbad.engine.maps import MappedDomain
 from deepsimbad.engine.worker import Stopwatch
-from deepsimbad.errors import DeepSimbadError, NotLoadedError
+from deepsimbad.errors import DeepSimbadError, NotLoadedError, UnknownDomainError, UnknownJobError
+from deepsimbad.fleet.all_jobs import AllJobs
 from deepsimbad.fleet.all_sessions import AllSessions
 from deepsimbad.fleet.asgi import asked
 from deepsimbad.fleet.backend import Backend
@@ -34,18 +36,31 @@ from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
 from deepsimbad.settings import Settings
 from deepsimbad.store.objects import Objects
-from deepsimbad.store.records import KeyRecord
+from deepsimbad.store.records import JobRecord, KeyRecord
 from deepsimbad.store.sessions import ListedSession
+from deepsimbad.store.shared_catalog import SharedCatalog
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
 _TIMEOUT_S = 5.0  # of what one asks of another
 _START_S = 60.0  # that a replica waits for the one that administers, whose keys it reads
 _THREADS = 64
 
+MakeRunJob: TypeAlias = Callable[[Path], RunJob]
+
 
 def replica_name(number: int) -> str:
     """Of the deployment: who answers for a domain is told by name, so that a restart moves nothing."""
     return f"domains-{number}"
+
+
+def administrator_name(number: int) -> str:
+    """Of the deployment of one that administers; of one alone as when there could be no other."""
+    return f"admin-{number}" if number else "admin"
+
+
+def administrator_folder(data_dir: Path, number: int) -> Path:
+    """The data directory of one that administers: the first has the fleet's own, the others theirs in it."""
+    return data_dir / "administrators" / str(number) if number else data_dir
 
 
 def keys_of(admin: "DeploymentHandle[Replica]") -> Callable[[], Sequence[KeyRecord]]:
@@ -63,19 +78,23 @@ class Replica:
 
     Args:
         settings: Of the whole fleet, which shares what is in its map store.
-        n_replicas: How many there are beside the one that administers.
+        n_replicas: How many there are beside those that administer.
+        n_administrators: How many of these.
         encoder: Has the networks; None: each has its own.
-        admin: The one that has the data directory, and runs jobs; None: this is it.
-        run_job: As `create_app`.
+        admin: The first that administers, which has the keys; None: this is it.
+        number: Of this one among those that administer, that have data directories and run jobs; None: it is none.
+        make_run_job: Makes what does jobs of a data directory, as `create_app` takes it; None: as there.
     """
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
         self,
         settings: Settings,
         n_replicas: int,
+        n_administrators: int,
         encoder: DeploymentHandle[Encoder] | None = None,
         admin: "DeploymentHandle[Replica] | None" = None,
-        run_job: RunJob | None = None,
+        number: int | None = None,
+        make_run_job: MakeRunJob | None = None,
     ) -> None:
         configure_logging(settings.log_level)
         # Whoever takes a session over waits for many objects, which should keep nobody else waiting.
@@ -83,46 +102,55 @@ class Replica:
         self._parts = AsyncExitStack()
         self._watching = list[asyncio.Task[None]]()
         objects = Objects.open(str(settings.map_store))
-        if admin is None:
-            elsewhere = Elsewhere(sessions=partial(AllSessions.sharing, objects))
-        else:
+        elsewhere, jobs = Elsewhere(), AllJobs()
+        if admin is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(admin.lives.remote(0), _START_S)
+            elsewhere = replace(elsewhere, keys=keys_of(admin))
+        if number is not None:
+            settings = settings.model_copy(update={"data_dir": administrator_folder(settings.data_dir, number)})
+            elsewhere = replace(
+                elsewhere,
+                sessions=partial(AllSessions.sharing, objects),
+                administrator=number,
+                newest_jobs=jobs.newest,
+            )
+        else:
             folder = new_folder()
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
             settings = settings.model_copy(update={"data_dir": folder})
             name = serve.get_replica_context().deployment
-            elsewhere = Elsewhere(
-                keys_of(admin),
-                partial(
-                    SharedSessionStore.sharing,
-                    objects,
-                    is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
-                ),
-            )
-            others = [Backend(serve.get_deployment_handle(replica_name(number))) for number in range(n_replicas)]
+            others = [Backend(serve.get_deployment_handle(replica_name(other))) for other in range(n_replicas)]
             self._watching += [asyncio.create_task(backend.watch()) for backend in others]
-            elsewhere = replace(elsewhere, owners=AskedOwners(others))
+            sessions = partial(
+                SharedSessionStore.sharing,
+                objects,
+                is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
+            )
+            elsewhere = replace(elsewhere, sessions=sessions, owners=AskedOwners(others))
         if encoder is not None:
             backend = Backend(encoder)
             self._watching.append(asyncio.create_task(backend.watch()))
             await backend.there(_TIMEOUT_S)
             asking = AskedEncoder(backend, asyncio.get_running_loop())
             elsewhere = replace(elsewhere, make_evaluator=by_encoder(asking))
-        self._app = create_app(settings, run_job, elsewhere)
+        self._app = create_app(settings, make_run_job and make_run_job(settings.data_dir), elsewhere)
         await self._parts.enter_async_context(self._app.router.lifespan_context(self._app))
         self._services: Services = self._app.state.services
         if isinstance(store := self._services.session_store, AllSessions):
-            replicas = [serve.get_deployment_handle(replica_name(number)) for number in range(n_replicas)]
-            store.replicas = replicas
+            store.replicas = [serve.get_deployment_handle(replica_name(replica)) for replica in range(n_replicas)]
+            beside = [each for each in range(n_administrators) if each != number]
+            jobs.others = [serve.get_deployment_handle(administrator_name(each)) for each in beside]
+            hear = (*store.replicas, *jobs.others, serve.get_deployment_handle("front"))
 
             async def announce() -> None:
-                asked = (each.reread_keys.remote() for each in (*replicas, serve.get_deployment_handle("front")))
+                asked = (each.reread_keys.remote() for each in hear)
                 told = asyncio.gather(*asked, return_exceptions=True)
                 with suppress(TimeoutError):  # who is away reads them at its start
                     await asyncio.wait_for(told, _TIMEOUT_S)
 
-            self._services.keys.announce = announce
+            if admin is None:
+                self._services.keys.announce = announce
 
     async def __del__(self) -> None:
         await self._parts.aclose()
@@ -137,6 +165,33 @@ class Replica:
     async def reread_keys(self) -> None:
         """Let the keys count as they are by now."""
         await self._services.keys.reread()
+
+    async def administrator_of(self, domain: str) -> int | None:
+        """Which of those that administer has made a domain; None: there is none."""
+
+        def told() -> int | None:
+            try:
+                return cast("SharedCatalog", self._services.catalog).administrator_of(domain)
+            except UnknownDomainError:
+                return None
+
+        return await asyncio.to_thread(told)
+
+    async def has_job(self, job_id: str) -> bool:
+        """Whether a job is one of this one's."""
+
+        def told() -> bool:
+            try:
+                self._services.catalog.job(job_id)
+            except UnknownJobError:
+                return False
+            return True
+
+        return await asyncio.to_thread(told)
+
+    async def jobs(self, before: int | None, limit: int) -> list[tuple[int, JobRecord]]:
+        """As `Catalog.numbered_jobs`, of all domains."""
+        return await asyncio.to_thread(self._services.catalog.numbered_jobs, None, before, limit)
 
     async def listed(self, session_ids: Sequence[str]) -> list[ListedSession]:
         """As `SharedSessionStore.listed`."""

@@ -370,7 +370,9 @@ def seen_twice(catalog: Catalog, camera_of: str, domain: DomainRecord, training:
         raise InvalidMapConfigError(f"{its_map} knows no second season: map it from two drives of its route first")
     stored = Traverse.list(catalog.data_dir, camera_of)
     if gone := [name for name in names if name not in stored]:
-        raise InvalidMapConfigError(f"{its_map} is made of traverse {gone[0]}, which is gone: map it anew first")
+        raise InvalidMapConfigError(
+            f"{its_map} is made of traverse {gone[0]}, which is not in this data directory: map it anew here first"
+        )
     drives = []
     for name in names:
         with Traverse.open(catalog.data_dir, camera_of, name) as traverse:

@@ -33,6 +33,7 @@ from deepsimbad.store.records import DomainRecord, MapRecord, MapState, from_jso
 T = TypeVar("T")
 _State: TypeAlias = dict[str, Any] | None
 _LEAST_BETWEEN_STATES = 256  # entries of the log; of many domains an eighth of their number
+_ADMINISTRATOR = "administrator"  # among a domain's options
 _N_LOCKS = 16  # of fetching: of two files seldom the same
 
 
@@ -98,6 +99,8 @@ class SharedCatalog(Catalog):
     store: MapStore
     is_in_use: Callable[[str, int, str], bool] = staticmethod(lambda _domain, _version, _sha256: False)
     """Whether a map, by its domain, version and digest, is in memory or pinned, and keeps its file."""
+    administrator: int = 0
+    """Which of several that administer this is; it is kept with the domains that are made here."""
 
     def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(data_dir, db)
@@ -270,9 +273,20 @@ class SharedCatalog(Catalog):
         max_domains: int | None = None,
     ) -> tuple[DomainRecord, bool]:
         """As `Catalog.create_domain`."""
-        create = super().create_domain
-        _, is_new = self._publish(name, lambda: create(name, evaluator, closed, actions_m, max_domains))
+        create, set_options = super().create_domain, super().set_options
+
+        def change() -> bool:
+            _, is_new = create(name, evaluator, closed, actions_m, max_domains)
+            if is_new and self.administrator > 0:
+                set_options(name, {_ADMINISTRATOR: self.administrator})
+            return is_new
+
+        is_new = self._publish(name, change)
         return self.domain(name), is_new
+
+    def administrator_of(self, name: str) -> int:
+        """Which of several that administer has made a domain; raises UnknownDomainError."""
+        return int(self.domain(name).options.get(_ADMINISTRATOR, 0))
 
     def set_options(self, name: str, options: Mapping[str, Any]) -> DomainRecord:
         """As `Catalog.set_options`."""

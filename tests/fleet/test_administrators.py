@@ -1,0 +1,258 @@
+"""Two that administer: each has its domains' drives and jobs, what is of all domains is whole, one dies alone."""
+
+import asyncio
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=ImportError)
+
+from deepsimbad.engine.session import domain_digits
+from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.placement import owners
+from deepsimbad.jobs.runner import InThisProcess
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.layout import traverse_path
+from deepsimbad.store.records import KeyScope
+from tests.contract.conftest import (
+    N_LANDMARKS,
+    RANKS,
+    TAKES_ENCODINGS,
+    Caller,
+    problem,
+    ready_encodings,
+    small_settings,
+    until,
+)
+from tests.fleet.running import running
+
+with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
+    from deepsimbad.fleet.administrators import Administrators
+    from deepsimbad.fleet.backend import Backend, Gone
+
+
+def of_fleet(test):
+    """A test of running fleets; Ray leaves sockets and files to the collector."""
+    quiet = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+    return pytest.mark.slow(quiet(test))
+
+
+def administered_by(number, of=2):
+    """Names of domains that one makes where there are so many."""
+    names = (f"route-{name}" for name in range(1000))
+    return (name for name in names if owners(domain_digits(name), of)[0] == number)
+
+
+# Who is asked
+
+
+@dataclass(eq=False)
+class Told(Backend):
+    """One that administers, and knows who made which domain, and its own jobs."""
+
+    made_by: dict[str, int] | None = None  # None: it is away
+    jobs: tuple[str, ...] = ()
+
+    async def ask(self, method, *arguments):
+        if self.made_by is None:
+            raise Gone
+        return self.made_by.get(*arguments) if method == "administrator_of" else arguments[0] in self.jobs
+
+
+def asked(administrators, path, query=b""):
+    """The places of those who may answer."""
+    who = asyncio.run(administrators.of(path, query))
+    return [administrators.backends.index(backend) for backend in who]
+
+
+def of_two(made_by):
+    return Administrators([Told(None, made_by=made_by, jobs=("a",)), Told(None, made_by=made_by, jobs=("b",))])
+
+
+@pytest.mark.parametrize("path", ["/v1/admin/domains/{}", "/v1/domains/{}/coverage", "/v1/admin/domains/{}/traverses"])
+def test_what_is_of_a_domain_is_its_administrators(path):
+    first, second = next(administered_by(0)), next(administered_by(1))
+    assert [asked(of_two({}), path.format(name)) for name in (first, second)] == [[0], [1]], "who is to make it"
+    made = of_two({first: 1, second: 0})  # while there were others
+    assert [asked(made, path.format(name)) for name in (first, second)] == [[1], [0]]
+    assert asked(made, "/v1/admin/jobs", f"limit=3&domain={first}".encode()) == [1]
+
+
+def test_a_domain_whose_administrator_there_is_not_is_refused_by_name():
+    with pytest.raises(UnavailableError, match="--administrators 3 or more") as refused:
+        asked(of_two({"far": 2}), "/v1/admin/domains/far/remaps")
+    assert refused.value.hints["reason"] == "no_administrator"
+    with pytest.raises(UnavailableError, match="--administrators 2 or more"):
+        asked(Administrators([Told(None, made_by={"far": 1})]), "/v1/domains/far")
+
+
+def test_a_job_is_whose_it_is_and_what_is_of_no_domain_is_anybodys():
+    administrators = of_two({})
+    assert [asked(administrators, f"/v1/admin/jobs/{job}") for job in ("a", "b", "c")] == [[0], [1], [0]]
+    assert asked(administrators, "/v1/admin/jobs/b/events") == [1]
+    for path in ("/v1/domains", "/v1/admin/jobs", "/v1/admin/sessions", "/console", "/healthz"):
+        assert asked(administrators, path) == [0, 1]
+
+
+def test_while_one_is_away_the_other_tells_whose_domains_are():
+    second = next(administered_by(1))
+    administrators = of_two({})
+    administrators.backends[0].made_by = None
+    assert asked(administrators, f"/v1/admin/domains/{second}") == [1]
+    assert asked(administrators, "/v1/admin/jobs/b") == [1]
+    for job in ("a", "c"):
+        with pytest.raises(UnavailableError, match="away"):
+            asked(administrators, f"/v1/admin/jobs/{job}")
+    administrators.backends[1].made_by = None
+    with pytest.raises(UnavailableError, match="away"):
+        asked(administrators, f"/v1/admin/domains/{second}")
+
+
+# A fleet
+
+
+class WaitsForTheOther:
+    """Does a job once one of another data directory is under way too: neither ends where they take turns."""
+
+    def __init__(self, data_dir):
+        self.run = InThisProcess(data_dir)
+        self.meeting = data_dir.parent.parent if data_dir.parent.name == "administrators" else data_dir
+        self.mine = self.meeting / f"working-{data_dir.name}"
+
+    def __call__(self, job, on_progress, is_cancelled):
+        if job.config.get("seed") == 1:
+            self.mine.touch()
+            until(lambda: len(list(self.meeting.glob("working-*"))) == 2)
+        return self.run(job, on_progress, is_cancelled)
+
+
+def filled(client, name):
+    """A domain with a drive."""
+    assert client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS).status_code == 201
+    client.upload(name, "drive", ready_encodings(), 2.0 * np.arange(len(ready_encodings())))
+
+
+CONFIG = {"training_traverse": "drive", "landmark_traverse": "drive", "n_landmarks": N_LANDMARKS, "list_length": 4}
+
+
+def jobs_listed(client, query=""):
+    """Pages of two, one behind the other."""
+    jobs, after = [], ""
+    while after is not None:
+        answer = client.get(f"/v1/admin/jobs?limit=2{query}{after}").json()
+        jobs += answer["jobs"]
+        after = answer["next"] and f"&after={answer['next']}"
+    return jobs
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory):
+    return tmp_path_factory.mktemp("administrators") / "data"
+
+
+@pytest.fixture(scope="module")
+def fleet(data_dir):
+    with running(small_settings(data_dir), make_run_job=WaitsForTheOther, n_administrators=2) as fleet:
+        yield fleet
+
+
+@pytest.fixture(scope="module")
+def client(fleet):
+    with Caller(base_url=fleet.url, timeout=120) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def names():
+    return next(administered_by(0)), next(administered_by(1))
+
+
+@of_fleet
+def test_two_domains_are_filled_and_mapped_at_once_and_listed_together(client, data_dir, names):
+    for name in names:
+        filled(client, name)
+    folders = data_dir, data_dir / "administrators" / "1"
+    for name, own, other in zip(names, folders, folders[::-1], strict=True):
+        assert traverse_path(own, name, "drive").exists()
+        assert not traverse_path(other, name, "drive").exists()
+    posted = [client.post(f"/v1/admin/domains/{name}/remaps", json={**CONFIG, "seed": 1}) for name in names]
+    jobs = [client.wait_for(answer.json()["job_id"]) for answer in posted]
+    assert [job["state"] for job in jobs] == ["succeeded"] * 2, jobs
+    assert [job["domain"] for job in jobs] == list(names)
+    for name in names:
+        assert client.post(f"/v1/domains/{name}/localizations", json=RANKS).json()["map_version"] == 1
+        assert client.session(name)
+    listed = client.get("/v1/domains").json()["domains"]
+    assert [(domain["name"], domain["map_version"]) for domain in listed] == [(name, 1) for name in sorted(names)]
+    assert len(client.get("/v1/admin/sessions").json()["sessions"]) == 2
+    ready = client.get("/readyz")
+    assert ready.json() == {"status": "ready", "damaged_maps": []}
+    assert ready.headers["x-request-id"]
+    assert 'deepsimbad_jobs{state="succeeded"} 2.0' in client.get("/metrics").text
+
+
+@of_fleet
+def test_jobs_are_one_list_in_the_order_of_their_making(client, names):
+    first, second = names
+    made = [client.remap(name, **CONFIG)["job_id"] for name in (second, first, first, second)]
+    listed = jobs_listed(client)
+    assert [job["job_id"] for job in listed[:4]] == made[::-1]
+    assert len(listed) == len({job["job_id"] for job in listed}) == 6
+    for name in names:
+        of_domain = jobs_listed(client, f"&domain={name}")
+        assert of_domain == [job for job in listed if job["domain"] == name]
+    assert client.get(f"/v1/admin/jobs/{made[0]}/events").text.count("event: done") == 1
+    assert client.delete(f"/v1/admin/jobs/{made[0]}").status_code == 204
+    problem(client.get("/v1/admin/jobs/none"), 404, "unknown_job")
+
+
+@of_fleet
+def test_while_one_is_away_the_other_administers_and_what_it_had_is_there_when_it_is_back(
+    fleet, client, data_dir, names
+):
+    first, second = names
+    maps = client.get(f"/v1/admin/domains/{second}/maps").json()
+    dying = fleet.pids("admin-1")
+    fleet.kill("admin-1")
+    assert client.remap(first, **CONFIG)["state"] == "succeeded"
+    assert client.get("/v1/domains").status_code == 200
+    until(lambda: fleet.pids("admin-1") not in ([], dying))
+    until(lambda: client.get(f"/v1/admin/domains/{second}/maps").status_code == 200)
+    assert client.get(f"/v1/admin/domains/{second}/maps").json() == maps
+    assert client.remap(second, **CONFIG)["state"] == "succeeded"
+    assert len(jobs_listed(client)) == 8
+
+
+@of_fleet
+def test_a_key_counts_with_all_of_them_before_it_counts_with_the_first(client, data_dir, names):
+    with Catalog.open(data_dir) as catalog:
+        _, admin = catalog.create_key(KeyScope.ADMIN)
+    until(lambda: client.get(f"/v1/domains/{names[0]}").status_code == 401)
+    for name in (*names, "none"):
+        assert client.get(f"/v1/domains/{name}").status_code == 401
+        answer = client.get(f"/v1/domains/{name}", headers={"X-API-Key": admin.text})
+        assert answer.status_code == (404 if name == "none" else 200)
+
+
+@of_fleet
+def test_another_number_moves_no_domain(tmp_path: Path):
+    settings = small_settings(tmp_path / "data", map_store=f"file://{tmp_path}/store")
+    names = administered_by(1)
+    before, of_second = next(names), next(names)
+    with running(settings, make_run_job=InThisProcess) as fleet, Caller(base_url=fleet.url, timeout=120) as client:
+        filled(client, before)  # which would be the second's, had it been there
+    with (
+        running(settings, make_run_job=InThisProcess, n_administrators=2) as fleet,
+        Caller(base_url=fleet.url, timeout=120) as client,
+    ):
+        filled(client, of_second)
+        for name in (before, of_second):
+            assert client.remap(name, **CONFIG)["state"] == "succeeded"
+    with running(settings, make_run_job=InThisProcess) as fleet, Caller(base_url=fleet.url, timeout=120) as client:
+        refused = problem(client.get(f"/v1/admin/domains/{of_second}/traverses"), 503, "unavailable")
+        assert refused["reason"] == "no_administrator"
+        assert client.get(f"/v1/admin/domains/{before}/traverses/drive").status_code == 200
+        assert client.post(f"/v1/domains/{of_second}/localizations", json=RANKS).status_code == 200, "robots go on"
