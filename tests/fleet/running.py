@@ -18,7 +18,8 @@ with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it us
     from deepsimbad.fleet import application
     from deepsimbad.fleet.application import from_yaml  # noqa: F401 - for tests
 
-_names = (f"fleet-{number}" for number in itertools.count())
+# Processes are found by these names, also those of tests that run beside these in another cluster.
+_names = (f"fleet-{os.getpid()}-{number}" for number in itertools.count())
 
 
 @cache
