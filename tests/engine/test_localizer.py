@@ -7,7 +7,16 @@ import pytest
 
 from deepsimbad.core.belief.evidence import TRUSTS
 from deepsimbad.core.relevance import OTHER_LIKELIHOOD_SCALE, Relevance
-from deepsimbad.engine.localizer import Dissimilarities, RankedLandmarks, ReadyEncoding, describe, localize
+from deepsimbad.engine import localizer
+from deepsimbad.engine.localizer import (
+    Dissimilarities,
+    PackedRanks,
+    RankedLandmarks,
+    ReadyEncoding,
+    describe,
+    is_short,
+    localize,
+)
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 
 from .conftest import DIM, LIST_LENGTH, N_IMAGES, N_LANDMARKS, map_contents
@@ -47,3 +56,15 @@ def test_every_relevance_finds_its_own_image(relevance: Relevance, closed: bool)
 def test_huge_dissimilarities_are_ranked_all_the_same() -> None:
     query = describe(map_contents(relevance=Relevance.SIMBAD), EVALUATOR, Dissimilarities(np.linspace(1e300, 1, 9)))
     assert query.ranks.tolist() == list(range(9, 0, -1))
+
+
+def test_what_takes_long_is_known_before_it_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    snapshot, whole = map_contents(), RankedLandmarks(tuple(range(N_LANDMARKS)))
+    assert is_short(snapshot, whole)
+    assert is_short(snapshot, ReadyEncoding(np.ones(DIM)))
+    assert not is_short(snapshot, RankedLandmarks(whole.landmark_ids[1:]))
+    assert not is_short(snapshot, PackedRanks(b""))
+    for relevance in (Relevance.SIMBAD, Relevance.BRUTE_FORCE):
+        assert not is_short(map_contents(relevance=relevance), whole)
+    monkeypatch.setattr(localizer, "_MOST_AT_ONCE", N_IMAGES - 1)
+    assert not is_short(snapshot, whole)

@@ -322,13 +322,13 @@ async def post_localization(
         def compare() -> NDArray[np.float32]:
             return relevances(snapshot, describe(snapshot, evaluator, view))
 
-        return npy_response(await running.worker.computed(compare, is_short=is_short(snapshot)))
+        return npy_response(await running.worker.computed(compare, is_short=is_short(snapshot, view)))
 
     def look() -> Localization:
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         return localize(snapshot, evaluator, view, shortlist, watch)
 
-    localization = await running.worker.computed(look, is_short=is_short(snapshot))
+    localization = await running.worker.computed(look, is_short=is_short(snapshot, view))
     if wants_geopose(request):
         record = await run_sync(running.catalog.domain, domain)  # as it is now
         anchor = record.options.get("anchor")

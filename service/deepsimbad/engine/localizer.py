@@ -123,8 +123,15 @@ def localize(
     return Localization(snapshot, relevance, best, summary, plan, is_informative)
 
 
-def is_short(snapshot: Map) -> bool:
-    """Whether a view of a map takes a millisecond or two, and no more, once it is encoded."""
+def is_short(snapshot: Map, view: View) -> bool:
+    """Whether a view of a map takes a millisecond or two, and no more, once it is encoded.
+
+    Of landmarks that were not sent the scores are expected ones, which takes several.
+    """
+    if isinstance(view, PackedRanks) or (
+        isinstance(view, RankedLandmarks) and len(view.landmark_ids) < snapshot.n_landmarks
+    ):
+        return False
     return snapshot.relevance in _BY_INDEX and snapshot.n_images <= _MOST_AT_ONCE
 
 
