@@ -127,6 +127,22 @@ def test_domains_and_what_serves_appear_at_others_and_files_are_fetched_by_need(
     assert there.domain("campus").actions_m == (3.0,)
 
 
+def test_all_know_which_of_several_that_administer_made_a_domain(node: MakeNode) -> None:
+    here, there = node("here"), node("there")
+    there.administrator = 3
+    make_domain(here)
+    make_domain(there, "city")
+    make_domain(there)  # which is there already
+    here.follow()
+    for options in ({"thumbnails": True}, {"thumbnails": False}):
+        here.set_options("city", options)
+        there.follow()
+        for catalog in (here, there):
+            assert [catalog.administrator_of(name) for name in ("campus", "city")] == [0, 3]
+    with pytest.raises(UnknownDomainError):
+        here.administrator_of("nowhere")
+
+
 def test_of_two_activations_at_once_one_is_lost(node: MakeNode, add_map: Callable[..., MapRecord]) -> None:
     here, there = node("here"), node("there")
     make_domain(here)
