@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from anyio.to_thread import run_sync
@@ -22,7 +22,7 @@ from deepsimbad.api.requests import (
     DomainName,
     JsonBody,
     LandmarkModelTag,
-    Running,
+    QuickRoute,
     Services,
     insisted_on,
     media_type_of,
@@ -54,7 +54,7 @@ from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
 PROBABLY = 0.5
-router = APIRouter(prefix="/v1/domains", tags=["localization"])
+router = APIRouter(prefix="/v1/domains", tags=["localization"], route_class=QuickRoute)
 
 RANKS = "application/vnd.deepsimbad.ranks"
 MAX_LANDMARKS = 0xFFFF
@@ -295,7 +295,6 @@ def render_belief(snapshot: Map, belief: BeliefSummary, is_confident: bool) -> B
 async def post_localization(
     domain: DomainName,
     request: Request,
-    running: Running,
     shortlist: Shortlist = None,
     if_match: LandmarkModelTag = None,
 ) -> Response:
@@ -304,7 +303,7 @@ async def post_localization(
     With `Accept: application/octet-stream` the answer is the relevance of every map image; with
     `application/geopose+json` the likeliest place on Earth, where the domain has an anchor.
     """
-    watch = Stopwatch()
+    watch, running = Stopwatch(), cast("Services", request.app.state.services)
     active = await running.active(domain)
     snapshot = active.snapshot
     media_type = media_type_of(request, OBSERVATION_TYPES)
