@@ -34,7 +34,7 @@ from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import build, measured, views_of
 
-N_LANDMARKS, N_SENT = (300, 500), (8, 16, 32, 48, 55, 64)
+N_LANDMARKS, N_SENT = (128, 256, 300, 500), (8, 16, 32, 48)  # and as many as the budget holds
 LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
 _DRIVES = ("nr", "nq", "nq2")
 _IMAGES_A_BLOCK = 16
@@ -137,7 +137,10 @@ def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
     rrf = [(drives, *drives.views(Relevance.RRF, n_landmarks)) for drives in triplets]
     columns = ((composed, "session"), (composed, "alone"), (rrf, "session"))
     whole: list[float] = []
-    for m in (n_landmarks, *N_SENT):
+    most = next(
+        m for m in range(n_landmarks, 0, -1) if len(pack_ranked_landmarks(range(m), n_landmarks)) <= BUDGET_BYTES
+    )
+    for m in (n_landmarks, *N_SENT, most):
         figures = np.array([[anr(*each, m, how) for each in maps] for maps, how in columns])
         means = figures[:, :, 0].mean(axis=1).tolist()
         whole = whole or means
