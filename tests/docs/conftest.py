@@ -94,6 +94,10 @@ class Workplace:
         (printed,) = [printed for command, printed in self.output.items() if part in command]
         return printed
 
+    def printed_by_python(self):
+        """What each Python example printed."""
+        return [printed for command, printed in self.output.items() if "import Client" in command]
+
 
 @pytest.fixture(scope="session")
 def readme():

@@ -1,12 +1,10 @@
-"""Every command, curl example and Python example of README and the pages beside it is run against a live service.
+"""Every command, curl example and Python example of the pages beside README is run against a live service.
 
-README's are run as printed, one after the other in a folder that is empty but for a part of the campus that they
-render; only the server's address is another. In the pages the folder of NCLT is a rendered campus in its layout.
+The folder of NCLT is a rendered campus in its layout.
 """
 
 import hashlib
 import json
-import os
 import shutil
 import time
 from contextlib import ExitStack
@@ -42,33 +40,14 @@ def furnished(folder, nclt):
 
 
 @pytest.fixture(scope="module")
-def first_hour(readme, nclt, tmp_path_factory):
-    """README, from top to bottom."""
-    place = Workplace(tmp_path_factory.mktemp("first_hour"))
-    shutil.copytree(nclt, place.folder / "nclt", copy_function=os.link)  # `campus` adds the frames that are missing
-    with ExitStack() as stack:
-        place.follow(readme, stack)
-        yield place
-
-
-@pytest.fixture(scope="module")
 def workplace(nclt, tmp_path_factory):
-    """The pages behind it."""
+    """All of them, from top to bottom."""
     place = Workplace(furnished(tmp_path_factory.mktemp("workplace"), nclt), **{"/data/nclt": nclt})
     with ExitStack() as stack:
         place.serve("data", stack)
         for name in ("recordings", "methods", "http"):
             place.follow(Page(PROJECT / "docs" / f"{name}.md"), stack)
         yield place
-
-
-def test_the_readme_runs_as_printed(first_hour):
-    assert len(first_hour.output) > 15
-    answer = json.loads(first_hour.answer_of("localizations?shortlist=3"))
-    assert len(answer["retrieval"]) == len(answer["belief"]["top"]) == 3
-    left = {path.name for path in (first_hour.folder / "replays" / "summer").iterdir()}
-    assert left >= {"steps.jsonl", "summary.json"}
-    assert "standardised" in first_hour.answer_of("experiment vpr")
 
 
 def test_a_posted_image_is_answered_with_a_belief(workplace):
@@ -134,8 +113,7 @@ def test_the_map_asked_for_by_curl_is_made(workplace):
         assert client.domain("nclt").map_version == 1
 
 
-def test_every_python_example_says_where(first_hour, workplace):
-    commands = [*first_hour.output.items(), *workplace.output.items()]
-    printed = [text for command, text in commands if "import Client" in command]
-    assert len(printed) > 2
+def test_every_python_example_says_where(workplace):
+    printed = workplace.printed_by_python()
+    assert len(printed) > 1
     assert all("95 % within" in text for text in printed)
