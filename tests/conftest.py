@@ -5,10 +5,13 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from deepsimbad_campus.writer import write_campus
 
@@ -22,7 +25,10 @@ for name in [name for name in os.environ if name.startswith("DEEPSIMBAD_") and n
 os.environ["DEEPSIMBAD_JOB_PRIORITY"] = (
     "normal"  # tests keep every core busy: an idle-class job would wait for them all
 )
-os.environ["GOMP_SPINCOUNT"] = "1000"  # every core is busy: threads that spin would keep each other waiting
+# Every core is busy with a test of its own, and OpenBLAS's threads spin for 20 ms after each product.
+threadpool_limits(1, user_api="blas")
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # of the processes that tests start, and of libraries that are loaded later
+os.environ["GOMP_SPINCOUNT"] = "1000"  # threads of OpenMP that spin would keep each other waiting
 os.environ.pop("COLUMNS", None)  # a parallel run sets one, too narrow for the tables that a pipe gets
 # Without bytecode every process would compile the sources, and the asserts of all tests, anew: they begin many.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -43,15 +49,32 @@ def real_data() -> Path:
     return folder
 
 
+@contextmanager
+def _one_at_a_time(tmp_path_factory, name: str) -> Iterator[Path]:
+    """The folder of all test processes; the others of the same name wait."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with (shared / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield shared
+
+
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory) -> Path:
     """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    with (shared / "campus.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with _one_at_a_time(tmp_path_factory, "campus") as shared:
         write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
     return shared / "campus"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled(tmp_path_factory) -> None:
+    """In a new checkout the first test process compiles the kernels for all, 20 seconds that each would spend."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - a second that a single file may do without
+
+        with _one_at_a_time(tmp_path_factory, "kernels"):
+            warm_up()
 
 
 @pytest.fixture
