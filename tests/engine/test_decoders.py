@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepsimbad.engine.pictures import Decoders
+from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import ImageTooLargeError, OverloadedError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.feature_l2 import FeatureL2

@@ -43,10 +43,11 @@ from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
 from deepsimbad.api.requests import Answer, Running, Services, Slots, refuse_unknown_parameters
 from deepsimbad.engine.atlas import Atlas, Owners
+from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import warm_up
 from deepsimbad.engine.maps import Maps, Retention
-from deepsimbad.engine.pictures import Decoders, Pictures
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths

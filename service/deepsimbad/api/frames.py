@@ -31,8 +31,8 @@ from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import FRAME_NAME, Drive
 from deepsimbad.core.frames import MAX_POSITION_M, content_digest
+from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.localizer import ready_encodings
-from deepsimbad.engine.pictures import Decoded
 from deepsimbad.engine.traverses import read_batch
 from deepsimbad.engine.worker import EncodedImage, Priority
 from deepsimbad.errors import EmptyBodyError, GreyLevelsDifferError, InvalidInputError

@@ -25,11 +25,12 @@ from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
 from deepsimbad.engine.atlas import Atlas, Owners
+from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.events import SessionEvents
 from deepsimbad.engine.localizer import View
 from deepsimbad.engine.maps import MappedDomain, Maps, Retention
-from deepsimbad.engine.pictures import Decoders, Pictures
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths

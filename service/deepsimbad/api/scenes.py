@@ -5,7 +5,7 @@ from typing import Any
 
 from deepsimbad.api.requests import JSON, Services
 from deepsimbad.core.camera import Camera
-from deepsimbad.engine.pictures import Decoded
+from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.worker import Priority
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import GreyLevels

@@ -24,10 +24,11 @@ from deepsimbad.cli.terminal import (
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, Map, check_actions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
+from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.localizer import NothingSeen, ReadyEncoding, View
 from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
-from deepsimbad.engine.pictures import Decoded, Pictures
+from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
 from deepsimbad.errors import CancelledError, DeepSimbadError
 from deepsimbad.evaluators.base import Evaluator

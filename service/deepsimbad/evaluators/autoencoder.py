@@ -15,7 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
-from deepsimbad.evaluators.trunk import Axes, Split, Trunk, UnitLesson, Verdict, no_better
+from deepsimbad.evaluators.lessons import Split, UnitLesson, Verdict, no_better
+from deepsimbad.evaluators.trunk import Axes, Trunk
 
 _BOTTLENECK = 4
 _EPOCHS, _RATE, _DECAY = 150, 3e-3, 3e-3

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
-from deepsimbad.evaluators.trunk import Axes, PairScores, Split, Trunk, UnitLesson, Verdict, no_better, squared_l2
+from deepsimbad.evaluators.lessons import PairScores, Split, UnitLesson, Verdict, no_better, squared_l2
+from deepsimbad.evaluators.trunk import Axes, Trunk
 
 _HIDDEN = 32
 _EPOCHS, _BATCH, _MOST_QUERIES = 40, 64, 2048  # queries: at once, and an epoch
