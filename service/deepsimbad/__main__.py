@@ -1,5 +1,6 @@
 """The `deepsimbad` command, which says so in one line where the `service` extra is not installed."""
 
+import os
 import sys
 from importlib.util import find_spec
 
@@ -25,6 +26,9 @@ def main() -> None:
     if missing:
         sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[service]'\n")
         sys.exit(1)
+    # OpenBLAS's threads spin for 20 ms after each product, on cores that other work wants; 2^16 cycles are some ten
+    # microseconds. Read when NumPy is loaded; an operator may set it otherwise.
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "16")
     from deepsimbad.cli import run  # noqa: PLC0415 - only now is it known to be there
 
     sys.exit(run())
