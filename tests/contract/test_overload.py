@@ -48,7 +48,7 @@ def test_a_full_queue(busy):
 
 def test_long_views_wait_in_the_queue(busy, monkeypatch):
     """A map too large to be answered between two requests is answered by the worker, in turn."""
-    monkeypatch.setattr("deepsimbad.engine.localizer._MOST_AT_ONCE", 0)
+    monkeypatch.setattr("deepsimbad.engine.localizer._MOST_IMAGES", 0)
     path = busy.session()
     worker, gate, begun = busy.services.worker, threading.Event(), threading.Event()
     worker.submit(lambda: (begun.set(), gate.wait(60)))

@@ -1,5 +1,6 @@
 """One view localized, against the formulas written out slowly."""
 
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -17,6 +18,7 @@ from deepsimbad.engine.localizer import (
     is_short,
     localize,
 )
+from deepsimbad.engine.worker import EncodedImage
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 
 from .conftest import DIM, LIST_LENGTH, N_IMAGES, N_LANDMARKS, map_contents
@@ -66,5 +68,15 @@ def test_what_takes_long_is_known_before_it_is_begun(monkeypatch: pytest.MonkeyP
     assert not is_short(snapshot, PackedRanks(b""))
     for relevance in (Relevance.SIMBAD, Relevance.BRUTE_FORCE):
         assert not is_short(map_contents(relevance=relevance), whole)
-    monkeypatch.setattr(localizer, "_MOST_AT_ONCE", N_IMAGES - 1)
-    assert not is_short(snapshot, whole)
+    assert is_short(snapshot, whole, 100)
+    assert not is_short(snapshot, whole, 101)
+    fused = replace(snapshot, evaluator={"kind": "fused"})
+    assert is_short(fused, whole)
+    assert not is_short(fused, ReadyEncoding(np.ones(DIM)))
+    assert not is_short(fused, EncodedImage(np.ones(DIM, np.float32), None, 0.0))
+    for name, most in (("_MOST_IMAGES", N_IMAGES - 1), ("_MOST_SUMMED", LIST_LENGTH * N_IMAGES - 1)):
+        with monkeypatch.context() as patched:
+            patched.setattr(localizer, name, most)
+            assert not is_short(snapshot, whole)
+    monkeypatch.setattr(localizer, "_MOST_PRODUCTS", DIM * N_LANDMARKS - 1)
+    assert not is_short(snapshot, ReadyEncoding(np.ones(DIM)))

@@ -200,3 +200,18 @@ def test_what_is_short_runs_where_it_is_asked_for(worker: InferenceWorker) -> No
 
     assert asyncio.run(where(is_short=True)) == threading.current_thread().name
     assert asyncio.run(where(is_short=False)) == "inference"
+
+
+def test_a_network_that_cannot_be_loaded_fails_its_views_and_the_thread_goes_on(worker: InferenceWorker) -> None:
+    class Missing:
+        @property
+        def largest_batch(self) -> int:
+            raise InvalidInputError("no weights")
+
+        def encode(self, _: object) -> None:
+            raise InvalidInputError("no weights")
+
+    with pytest.raises(InvalidInputError, match="no weights"):
+        worker.encode(Missing(), grey(1)).result(60)
+    assert worker.encode(Eyes(1), grey(7)).result(60).values[0] == 7
+    assert worker.is_alive

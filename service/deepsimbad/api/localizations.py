@@ -327,7 +327,7 @@ async def post_localization(
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         return localize(snapshot, evaluator, view, shortlist, watch)
 
-    localization = await running.worker.computed(look, is_short=is_short(snapshot, view))
+    localization = await running.worker.computed(look, is_short=is_short(snapshot, view, shortlist))
     if wants_geopose(request):
         record = await run_sync(running.catalog.domain, domain)  # as it is now
         anchor = record.options.get("anchor")

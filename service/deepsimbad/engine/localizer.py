@@ -27,13 +27,18 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import is_blank
+from deepsimbad.evaluators.registry import EvaluatorKind
 from deepsimbad.evaluators.scenes import Scene
 from deepsimbad.evaluators.space import seen
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
 _BY_INDEX = frozenset(Relevance) - {Relevance.SIMBAD, Relevance.BRUTE_FORCE}  # the others read all encodings or more
-_MOST_AT_ONCE = 1 << 15  # map images
+# Of a view that is short
+_MOST_IMAGES = 1 << 15
+_MOST_SUMMED = 1 << 18  # entries of lists
+_MOST_PRODUCTS = 1 << 22  # of numbers of its encoding with landmarks
+_LONGEST_SHORTLIST = 100
 
 # The forms in which a view reaches the engine
 
@@ -123,16 +128,19 @@ def localize(
     return Localization(snapshot, relevance, best, summary, plan, is_informative)
 
 
-def is_short(snapshot: Map, view: View) -> bool:
-    """Whether a view of a map takes a millisecond or two, and no more, once it is encoded.
-
-    Of landmarks that were not sent the scores are expected ones, which takes several.
-    """
-    if isinstance(view, PackedRanks) or (
-        isinstance(view, RankedLandmarks) and len(view.landmark_ids) < snapshot.n_landmarks
-    ):
-        return False
-    return snapshot.relevance in _BY_INDEX and snapshot.n_images <= _MOST_AT_ONCE
+def is_short(snapshot: Map, view: View, n_shortlist: int | None = None) -> bool:
+    """Whether a view of a map takes some three milliseconds at most, and waits for nothing, once it is encoded."""
+    n_landmarks = snapshot.n_landmarks
+    if isinstance(view, PackedRanks) or (isinstance(view, RankedLandmarks) and len(view.landmark_ids) < n_landmarks):
+        return False  # of landmarks that were not sent the scores are expected ones, which takes more
+    if isinstance(view, ReadyEncoding | EncodedImage):
+        # Others compare by networks of their own, or by those of another process.
+        is_plain = snapshot.evaluator.get("kind") == EvaluatorKind.FEATURE_L2
+        if not is_plain or view.values.size * n_landmarks > _MOST_PRODUCTS:
+            return False
+    n_summed = snapshot.list_length * max(snapshot.n_images, n_landmarks)
+    is_listed = snapshot.relevance in _BY_INDEX and n_summed <= _MOST_SUMMED and snapshot.n_images <= _MOST_IMAGES
+    return is_listed and (n_shortlist or 0) <= _LONGEST_SHORTLIST
 
 
 def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:

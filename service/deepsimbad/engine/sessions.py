@@ -369,7 +369,9 @@ class Sessions:
             view = await encoded(self._worker, engine.evaluator, view)
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch, view)
             try:
-                answer = await self._published(live, step, watch, is_short=is_short(engine.snapshot, view))
+                answer = await self._published(
+                    live, step, watch, is_short=is_short(engine.snapshot, view, observation.n_shortlist)
+                )
             except _CountedBefore as before:
                 answer = await self._repeated(live, state, before.sequence, observation.n_shortlist)
                 watch.lap("summarise")

@@ -215,7 +215,11 @@ class _EncodingLine(_Line):
     def _with_company(self, first: _Work) -> list[_Work]:
         assert first.evaluator is not None
         some, until = [first], monotonic() + self._longest_wait_s
-        while len(some) < first.evaluator.largest_batch:
+        try:
+            largest = first.evaluator.largest_batch
+        except Exception:  # its network cannot be loaded, which encoding it will tell
+            return some
+        while len(some) < largest:
             left_s = until - monotonic()
             try:
                 following = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
