@@ -3,14 +3,18 @@
 import json
 import re
 import shutil
+from base64 import b64decode
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
 
+from deepsimbad.cli.trial import Album
+from deepsimbad.core.drive import Drive
 from deepsimbad.errors import CancelledError
 from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad_client.recordings.sources import open_source
 
 QUICK = ("--evaluator", "feature_l2:gradient_grid")
 SWAPPED = (7, 21)
@@ -84,6 +88,24 @@ def test_two_folders_give_figures_and_one_page_that_asks_for_nothing(deepsimbad,
     linked = {link["href"] for link in page.of("a")}
     assert {f"#q{row}" for row in SWAPPED} <= linked
     assert "prefers-color-scheme: dark" in text
+
+
+@pytest.mark.parametrize("size", [(640, 320), (320, 640), (900, 90), (120, 60)])
+def test_a_picture_is_small_and_of_the_frames_shape(tmp_path, size):
+    view = np.random.default_rng(0).integers(0, 20, (size[1], size[0], 3), np.uint8)  # a copy in few pixels is shorter
+    view[:, size[0] // 2 :] += 230
+    cv2.imwrite(str(tmp_path / "0.png"), view)
+    drive = Drive(position_m=np.zeros(1), encodings=np.ones((1, 2), np.float32))
+    album = Album(open_source(str(tmp_path)), drive, 10**6)
+    picture = album.shown(0)["picture"]
+    shrunk = max(1.0, max(size) / 200)
+    assert (picture.width, picture.height) == (round(size[0] / shrunk), round(size[1] / shrunk))
+    body = b64decode(picture.uri.partition("base64,")[2])
+    shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
+    assert shown.shape[:2] == (picture.height, picture.width)
+    assert (shown[:, : picture.width // 3] < 60).all()
+    assert (shown[:, -picture.width // 3 :] > 200).all()
+    assert album.n_bytes == len(body)
 
 
 def test_a_second_run_encodes_nothing_and_one_that_was_stopped_goes_on(

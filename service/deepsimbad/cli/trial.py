@@ -28,7 +28,7 @@ from deepsimbad.cli.terminal import (
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
 from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageError
-from deepsimbad.evaluators.image import decode_image
+from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments.kept import kept_encodings
@@ -212,11 +212,13 @@ class Album:
 
     def _picture(self, row: int) -> Picture | None:
         try:
-            image = decode_image(self._recording.image(self._frames[row], None).body, self._max_pixels)
+            read = self._recording.image(self._frames[row], (_LONGEST_PX, _LONGEST_PX)).body
+            image = decode_image(read, self._max_pixels)
         except (BrokenFrameError, InvalidImageError, ImageTooLargeError):
             return None
-        scale = min(1.0, _LONGEST_PX / max(image.shape[:2]))
-        width, height = (max(1, round(scale * side)) for side in (image.shape[1], image.shape[0]))
+        shape = picture_size(read) or (image.shape[1], image.shape[0])  # a square copy tells what it is of
+        scale = min(1.0, _LONGEST_PX / max(shape))
+        width, height = (max(1, round(scale * side)) for side in shape)
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         body = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
         self.n_bytes += len(body)
