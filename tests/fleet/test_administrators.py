@@ -89,6 +89,16 @@ def test_a_domain_whose_administrator_there_is_not_is_refused_by_name():
         asked(Administrators([Told(None, made_by={"far": 1})]), "/v1/domains/far")
 
 
+def test_a_domain_made_anew_is_whose_it_is_now():
+    administrators = of_two({"moved": 2})
+    with pytest.raises(UnavailableError, match="--administrators 3 or more"):
+        asked(administrators, "/v1/domains/moved")
+    for number in (1, 0):
+        for backend in administrators.backends:
+            backend.made_by["moved"] = number
+        assert asked(administrators, "/v1/domains/moved") == [number]
+
+
 def test_a_job_is_whose_it_is_and_what_is_of_no_domain_is_anybodys():
     administrators = of_two({})
     assert [asked(administrators, f"/v1/admin/jobs/{job}") for job in ("a", "b", "c")] == [[0], [1], [0]]

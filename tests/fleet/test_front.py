@@ -14,6 +14,7 @@ with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it us
     from deepsimbad.fleet.administrators import Administrators
     from deepsimbad.fleet.backend import Backend, Gone
     from deepsimbad.fleet.front import Front, added_up
+    from deepsimbad.settings import Settings
 
 
 def told(n_requests, n_sessions, ready):
@@ -127,3 +128,45 @@ def test_of_several_that_administer_the_disk_and_readiness_of_the_worst_are_told
     assert answered("/metrics", fine, full) == (200, health(1.0, 2.0, 3.0))
     assert answered("/metrics", fine, broken) == (200, health(0.0, 50.0, 5.0))
     assert answered("/metrics", Administering(), fine) == (200, health(1.0, 90.0, 1.0))
+
+
+class Started:
+    """The handle of a deployment, whose one process is there or never comes."""
+
+    def __init__(self, is_there=True):
+        self.is_there = is_there
+        self.lives = self.keys = self
+
+    def remote(self, *arguments):
+        return self if not arguments else asyncio.sleep(3600.0 if arguments[0] or not self.is_there else 0.0)
+
+    def result(self, timeout_s):
+        return []
+
+
+class Listens:
+    """In the place of an HTTP server."""
+
+    def __init__(self, config):
+        pass
+
+    async def serve(self, sockets):
+        sockets[0].close()
+
+
+def test_the_front_listens_while_one_that_administers_is_away(monkeypatch, tmp_path):
+    monkeypatch.setattr(front, "configure_logging", lambda _level: None)
+    monkeypatch.setattr(front.uvicorn, "Server", Listens)
+
+    async def listening(*administrators):
+        asked = Front.__new__(Front)
+        settings = Settings(data_dir=tmp_path, host="127.0.0.1", port=0)
+        await asyncio.wait_for(asked.__init__(settings, administrators, [Started(), Started()]), 60.0)
+        address = await asked.address()
+        await asked._serving
+        for task in asked._watching:
+            task.cancel()
+        await asyncio.gather(*asked._watching, return_exceptions=True)
+        return address
+
+    assert asyncio.run(listening(Started(), Started(is_there=False)))[1] > 0

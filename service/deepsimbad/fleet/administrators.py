@@ -24,7 +24,6 @@ class Administrators:
 
     def __init__(self, backends: Sequence[Backend]) -> None:
         self.backends = backends
-        self._numbers: dict[str, int] = {}  # of domains that there are
 
     async def of(self, path: str, query: bytes) -> Sequence[Backend]:
         """Who may answer a request, by its decoded path and its query, the better one first.
@@ -43,12 +42,9 @@ class Administrators:
         return self.backends
 
     async def _of_domain(self, domain: str) -> Backend:
-        number = self._numbers.get(domain)
-        if number is None:
-            number = await self._told(domain)
-            if number is None:  # whoever is asked to make it
-                return self.backends[owners(domain_digits(domain), len(self.backends))[0]]
-            self._numbers[domain] = number
+        number = await self._told(domain)  # each time: it may have been deleted, and made anew by another
+        if number is None:  # whoever is asked to make it
+            return self.backends[owners(domain_digits(domain), len(self.backends))[0]]
         if number >= len(self.backends):
             raise UnavailableError(
                 f"domain {domain} is administered by number {number}, counted from 0, and the fleet has "

@@ -68,7 +68,8 @@ class Front:
         self._replicas = [Backend(handle) for handle in replicas]
         backends = [*self._administrators.backends, *self._replicas]
         self._watching = [asyncio.create_task(backend.watch()) for backend in backends]
-        while any(backend.gone is None for backend in backends):
+        needed = [backends[0], *self._replicas]  # the keys, and who serves robots; another may be away for long
+        while any(backend.gone is None for backend in needed):
             await asyncio.sleep(0.05)
         self._keys = KeyRing()
         await asyncio.to_thread(self._keys.load, keys_of(administrators[0]))
