@@ -200,7 +200,7 @@ SESSION = [("a" * 32, {"filter": "grid", "seed": 7}, 3, 4630.0), (2, [0.25, 0.75
                 *(f"catalog_v{version}", "catalog.sqlite", the_catalog),
                 [(1, {"anr": 4.5}, "2026-11-20T10:00:00.000Z"), [(JobState.SUCCEEDED, 2)]],
             )
-            for version in (2, 3, 4, 5, 6)
+            for version in (2, 3, 4, 5, 6, 7)
         ),
         *((f"traverse_v{v}", "domains/campus/traverses/summer.sqlite", the_traverse, FRAMES) for v in range(1, 9)),
         *((f"session_v{version}", "sessions.sqlite", the_sessions, SESSION) for version in (1, 2, 3, 4, 5)),

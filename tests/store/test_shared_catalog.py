@@ -128,8 +128,7 @@ def test_domains_and_what_serves_appear_at_others_and_files_are_fetched_by_need(
 
 
 def test_all_know_which_of_several_that_administer_made_a_domain(node: MakeNode) -> None:
-    here, there = node("here"), node("there")
-    there.administrator = 3
+    here, there = node("here"), node("there", administrator=3)
     make_domain(here)
     make_domain(there, "city")
     make_domain(there)  # which is there already
@@ -141,6 +140,20 @@ def test_all_know_which_of_several_that_administer_made_a_domain(node: MakeNode)
             assert [catalog.administrator_of(name) for name in ("campus", "city")] == [0, 3]
     with pytest.raises(UnknownDomainError):
         here.administrator_of("nowhere")
+
+
+def test_a_data_directory_keeps_the_number_of_who_administers_it(node: MakeNode, tmp_path: Path) -> None:
+    with Catalog.open(tmp_path / "there") as before:  # of a service that followed no store yet
+        make_domain(before)
+    node("there", administrator=3).close()
+    command = node("there")
+    make_domain(command, "city")
+    here = node("here")
+    assert [here.administrator_of(name) for name in ("campus", "city")] == [3, 3]
+    command.close()
+    make_domain(node("there", administrator=1), "port")
+    here.follow()
+    assert [here.administrator_of(name) for name in ("city", "port")] == [3, 1]
 
 
 def test_of_two_activations_at_once_one_is_lost(node: MakeNode, add_map: Callable[..., MapRecord]) -> None:

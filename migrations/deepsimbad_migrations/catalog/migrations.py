@@ -123,3 +123,9 @@ def m007_maps_shared_as_objects(db: Database) -> None:
         ALTER TABLE map ADD COLUMN shared INTEGER NOT NULL DEFAULT 0;
         """
     )
+
+
+@migrations()
+def m008_administrator_of_a_data_directory(db: Database) -> None:
+    """Which of several that administer has the data directory, so that commands on it know; 0 where it is alone."""
+    db.execute("ALTER TABLE map_store ADD COLUMN administrator INTEGER NOT NULL DEFAULT 0")

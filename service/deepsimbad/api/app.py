@@ -92,7 +92,7 @@ class Elsewhere:
     # Opens those of a data directory, told whom to tell of every transaction
     sessions: Callable[[Path, Callable[[int], None]], SessionStore] = SessionStore.open
     owners: Owners | None = None  # of domains, where one view is asked of many
-    administrator: int = 0  # which of several that administer this is, each with domains of its own
+    administrator: int | None = None  # which of several that administer; None: as the data directory notes
     # A page of the jobs of a catalog and of others, as `Catalog.newest_jobs`
     newest_jobs: Callable[[Catalog, str | None, int | None, int], ListPage[JobRecord, int]] = Catalog.newest_jobs
     make_evaluator: Callable[[EvaluatorConfig, Compute | None], Evaluator] = make_evaluator
@@ -216,9 +216,9 @@ async def _sweep(services: Services) -> None:
             log.exception("expired sessions could not be ended")
 
 
-def _opened(settings: Settings) -> Catalog:
+def _opened(settings: Settings, administrator: int | None) -> Catalog:
     """The catalog; one that is shared knows what others published, as far as the store can be reached."""
-    catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
+    catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes, administrator)
     if isinstance(catalog, SharedCatalog):
         try:
             catalog.catch_up()
@@ -235,7 +235,7 @@ def _start(
 ) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(service_lock(settings.data_dir, f"{settings.host}:{settings.port}"))
-    catalog = parts.enter_context(_opened(settings))
+    catalog = parts.enter_context(_opened(settings, elsewhere.administrator))
     keys.load(elsewhere.keys or catalog.keys)
     settings.check_exposure(len(keys.by_id))
     try:
@@ -268,7 +268,6 @@ def _start(
     )
     parts.callback(live.close)
     if isinstance(catalog, SharedCatalog):
-        catalog.administrator = elsewhere.administrator
         catalog.is_in_use = lambda domain, version, digest: (
             maps_.holds(domain, version, digest) or (domain, version) in SessionStore.pins(store)  # of those read here
         )

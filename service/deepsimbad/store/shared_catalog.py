@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -37,12 +38,15 @@ _ADMINISTRATOR = "administrator"  # among a domain's options
 _N_LOCKS = 16  # of fetching: of two files seldom the same
 
 
-def open_catalog(data_dir: Path, map_store: str | None = None, cache_bytes: int | None = None) -> Catalog:
+def open_catalog(
+    data_dir: Path, map_store: str | None = None, cache_bytes: int | None = None, administrator: int | None = None
+) -> Catalog:
     """The catalog of a data directory, as `Catalog.open`; a shared one where it follows a map store, once and for all.
 
     Args:
         map_store: URL of the store; None: the one that the data directory follows already, if any.
         cache_bytes: Of map files that may lie in the data directory though the store has them; None: any number.
+        administrator: Which of several that administer has the data directory, noted there; None: what it notes.
 
     Raises:
         MissingPackageError, SettingsError: As `Objects.open`.
@@ -55,7 +59,7 @@ def open_catalog(data_dir: Path, map_store: str | None = None, cache_bytes: int 
     store = MapStore.open(map_store or str(followed))
     catalog = SharedCatalog.open(data_dir)
     try:
-        catalog.begin_to_follow(store, cache_bytes, is_new=store.url != followed)
+        catalog.begin_to_follow(store, cache_bytes, administrator, is_new=store.url != followed)
     except BaseException:
         catalog.close()
         raise
@@ -100,7 +104,7 @@ class SharedCatalog(Catalog):
     is_in_use: Callable[[str, int, str], bool] = staticmethod(lambda _domain, _version, _sha256: False)
     """Whether a map, by its domain, version and digest, is in memory or pinned, and keeps its file."""
     administrator: int = 0
-    """Which of several that administer this is; it is kept with the domains that are made here."""
+    """Which of several that administer has the data directory; it is kept with the domains that are made here."""
 
     def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(data_dir, db)
@@ -111,11 +115,21 @@ class SharedCatalog(Catalog):
         self._fetching = tuple(threading.Lock() for _ in range(_N_LOCKS))
         self._making_room, self._n_coming = threading.Lock(), 0
 
-    def begin_to_follow(self, store: MapStore, cache_bytes: int | None, *, is_new: bool) -> None:
+    def begin_to_follow(
+        self, store: MapStore, cache_bytes: int | None, administrator: int | None, *, is_new: bool
+    ) -> None:
         """Take up a store; raises as `open_catalog`."""
         self.store, self._cache_bytes = store, cache_bytes
-        if not is_new:
-            return
+        if is_new:
+            self._note_store(store)
+        with self._reading() as db:
+            self.administrator = int(db.execute("SELECT administrator FROM map_store").fetchone()[0])
+        if administrator not in {None, self.administrator}:  # nothing is written at most starts: the disk may be full
+            with self._writing() as db:
+                db.execute("UPDATE map_store SET administrator = ?", [administrator])
+            self.administrator = administrator
+
+    def _note_store(self, store: MapStore) -> None:
         store_id = store.store_id()
         with self._writing() as db:
             for url, present in db.execute("SELECT url, store_id FROM map_store").fetchall():
@@ -125,7 +139,8 @@ class SharedCatalog(Catalog):
                         f"directory to publish them to {store.url}",
                         map_store=url,
                     )
-            db.execute("INSERT OR IGNORE INTO map_store VALUES (1, ?, ?, 0)", [store.url, store_id])
+            insert = "INSERT OR IGNORE INTO map_store (id, url, store_id, position) VALUES (1, ?, ?, 0)"
+            db.execute(insert, [store.url, store_id])
             db.execute("UPDATE map_store SET url = ?", [store.url])
 
     # Following
@@ -262,7 +277,7 @@ class SharedCatalog(Catalog):
         with self._reading() as db:
             names = [name for (name,) in db.execute("SELECT name FROM domain WHERE shared = 0 ORDER BY name")]
         for name in names:
-            self._publish(name, lambda: None)
+            self._publish(name, partial(self._keep_administrator, name))
 
     def create_domain(
         self,
@@ -273,16 +288,21 @@ class SharedCatalog(Catalog):
         max_domains: int | None = None,
     ) -> tuple[DomainRecord, bool]:
         """As `Catalog.create_domain`."""
-        create, set_options = super().create_domain, super().set_options
+        create = super().create_domain
 
         def change() -> bool:
             _, is_new = create(name, evaluator, closed, actions_m, max_domains)
-            if is_new and self.administrator > 0:
-                set_options(name, {_ADMINISTRATOR: self.administrator})
+            if is_new:
+                self._keep_administrator(name)
             return is_new
 
         is_new = self._publish(name, change)
         return self.domain(name), is_new
+
+    def _keep_administrator(self, name: str) -> None:
+        """Within a change: say of a domain that it was made here; of the first that administers nothing is said."""
+        if self.administrator > 0:
+            super().set_options(name, {_ADMINISTRATOR: self.administrator})
 
     def administrator_of(self, name: str) -> int:
         """Which of several that administer has made a domain; raises UnknownDomainError."""
