@@ -30,7 +30,9 @@ from tests.contract.conftest import (
 from tests.fleet.running import running
 
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
+    from deepsimbad.fleet import backend
     from deepsimbad.fleet.administrators import Administrators
+    from deepsimbad.fleet.all_jobs import AllJobs
     from deepsimbad.fleet.backend import Backend, Gone
 
 
@@ -119,6 +121,52 @@ def test_while_one_is_away_the_other_tells_whose_domains_are():
     administrators.backends[1].made_by = None
     with pytest.raises(UnavailableError, match="away"):
         asked(administrators, f"/v1/admin/domains/{second}")
+
+
+def test_one_that_does_not_answer_soon_is_as_one_that_is_away(monkeypatch):
+    monkeypatch.setattr(backend, "BRIEFLY_S", 0.05)
+    administrators = of_two({})
+
+    async def never(*_):
+        await asyncio.sleep(3600.0)
+
+    administrators.backends[0].ask = never
+    second = next(administered_by(1))
+    assert asked(administrators, f"/v1/admin/domains/{second}") == [1]
+    assert asked(administrators, "/v1/admin/jobs/b") == [1]
+    with pytest.raises(UnavailableError, match="away"):
+        asked(administrators, "/v1/admin/jobs/a")
+
+
+class Queued:
+    """The answer of one that administers, which never comes, or does."""
+
+    def __init__(self, jobs=None):
+        self.answer, self.jobs, self.is_cancelled = jobs, self, False
+
+    def remote(self, before, limit):
+        return self
+
+    def result(self, timeout_s):
+        if self.answer is None:
+            raise TimeoutError
+        return self.answer
+
+    def cancel(self):
+        self.is_cancelled = True
+
+
+def test_jobs_of_one_that_is_away_are_not_waited_for_after_the_refusal(tmp_path):
+    jobs = AllJobs()
+    jobs.others = [Queued([]), Queued(), Queued()]
+    with Catalog.open(tmp_path) as catalog:
+        with pytest.raises(UnavailableError, match="one of those that administer is away") as refused:
+            jobs.newest(catalog, None, None, 5)
+        assert refused.value.hints["retry_after_s"] > 0
+        assert all(answer.is_cancelled for answer in jobs.others[1:])
+        jobs.others = [Queued([])]
+        assert jobs.newest(catalog, None, None, 5).records == ()
+        assert not jobs.others[0].is_cancelled
 
 
 # A fleet

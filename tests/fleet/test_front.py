@@ -7,14 +7,19 @@ from http import HTTPStatus
 
 import pytest
 
+from deepsimbad.api.keys import KeyRing
+from deepsimbad.errors import UnavailableError
+from deepsimbad.settings import Settings
+from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.records import KeyRecord, KeyScope
+
 pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=ImportError)
 
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
-    from deepsimbad.fleet import front
+    from deepsimbad.fleet import backend, front
     from deepsimbad.fleet.administrators import Administrators
     from deepsimbad.fleet.backend import Backend, Gone
     from deepsimbad.fleet.front import Front, added_up
-    from deepsimbad.settings import Settings
 
 
 def told(n_requests, n_sessions, ready):
@@ -128,6 +133,50 @@ def test_of_several_that_administer_the_disk_and_readiness_of_the_worst_are_told
     assert answered("/metrics", fine, full) == (200, health(1.0, 2.0, 3.0))
     assert answered("/metrics", fine, broken) == (200, health(0.0, 50.0, 5.0))
     assert answered("/metrics", Administering(), fine) == (200, health(1.0, 90.0, 1.0))
+
+
+class Stuck(Backend):
+    """One that does not answer, though its process lives."""
+
+    def __init__(self):
+        super().__init__(None)
+
+    async def ask(self, method, *arguments):
+        await asyncio.sleep(3600.0)
+
+
+def test_who_does_not_answer_soon_hangs_no_answer_of_the_others(monkeypatch):
+    monkeypatch.setattr(backend, "BRIEFLY_S", 0.05)
+    status, body = answered("/readyz", ready(), Stuck())
+    assert (status, json.loads(body)["code"]) == (503, "unavailable")
+    healthy = health(1.0, 90.0, 1.0)
+    assert answered("/metrics", Administering(body=healthy.encode()), Stuck()) == (200, healthy)
+    asked = Front.__new__(Front)
+    asked._administrators, asked._replicas = Administrators([ready(), Stuck()]), []
+    last = {"type": "http.response.body", "body": b""}
+    asyncio.run(asyncio.wait_for(asked._before_last(last, asked._administrators.backends[0]), 60.0))
+
+
+def test_a_key_that_is_not_a_domains_learns_nothing_of_its_administrator():
+    key = ApiKey.new()
+    of_one = KeyRecord(key.key_id, "", KeyScope.LOCALIZE, key.secret_sha256, ("mine",), "2026-11-30", None, None)
+
+    class Elsewhere(Backend):
+        async def ask(self, method, *arguments):
+            return 7
+
+    asked = Front.__new__(Front)
+    asked._administrators, asked._replicas, asked._keys = Administrators([Elsewhere(None)]), [], KeyRing()
+    asked._keys.load(lambda: [of_one])
+
+    def who(path):
+        scope = {"path": path, "query_string": b"", "headers": [(b"x-api-key", key.text.encode())]}
+        return asyncio.run(asked._who(scope))[0]
+
+    with pytest.raises(UnavailableError, match="number 7"):
+        who("/v1/domains/mine")
+    for path in ("/v1/domains/theirs", "/v1/domains/theirs/coverage", "/v1/admin/domains/mine"):
+        assert who(path) == asked._administrators.backends, "any of them refuses"
 
 
 class Started:

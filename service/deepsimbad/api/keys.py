@@ -109,13 +109,16 @@ class KeyRing:
             raise
         state |= {"key_id": key.key_id, "key_scope": key.scope, "domains": key.domains}
         rate_limit.take(key.key_id)
-        if not key.scope.includes(needed):
-            raise ForbiddenError(
-                f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value
-            )
-        of_domain = _OF_DOMAIN.match(scope["path"])
-        if key.domains is not None and of_domain is not None and of_domain[1] not in key.domains:
-            raise ForbiddenError("this key is for other domains", domains=list(key.domains))
+        check_reach(key, scope["path"], needed)
+
+
+def check_reach(key: KeyRecord, path: str, needed: KeyScope) -> None:
+    """Raise ForbiddenError where a key has not the scope that is needed, or a decoded path is of another's domain."""
+    if not key.scope.includes(needed):
+        raise ForbiddenError(f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value)
+    of_domain = _OF_DOMAIN.match(path)
+    if key.domains is not None and of_domain is not None and of_domain[1] not in key.domains:
+        raise ForbiddenError("this key is for other domains", domains=list(key.domains))
 
 
 def needed_scope(path: str) -> KeyScope | None:

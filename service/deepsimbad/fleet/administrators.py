@@ -57,7 +57,7 @@ class Administrators:
         """Who made a domain; None: there is none. All of them know."""
         for backend in self.backends:
             try:
-                number: int | None = await backend.ask("administrator_of", domain)
+                number: int | None = await backend.ask_briefly("administrator_of", domain)
             except Gone:
                 continue
             return number
@@ -65,7 +65,7 @@ class Administrators:
 
     async def _of_job(self, job_id: str) -> Backend:
         """Who has a job; the first where nobody has, to say so."""
-        asked = (backend.ask("has_job", job_id) for backend in self.backends)
+        asked = (backend.ask_briefly("has_job", job_id) for backend in self.backends)
         answers = await asyncio.gather(*asked, return_exceptions=True)
         if True in answers:
             return self.backends[answers.index(True)]

@@ -1,6 +1,7 @@
 """The jobs of the whole fleet, as a list that those who administer are asked for."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from ray.exceptions import RayError
@@ -8,6 +9,7 @@ from ray.serve.exceptions import RayServeException
 from ray.serve.handle import DeploymentHandle
 
 from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.backend import AWAY_S
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, ListPage
 
@@ -29,8 +31,12 @@ class AllJobs:
         try:
             numbered += [entry for answer in asked for entry in answer.result(timeout_s=_TIMEOUT_S)]
         except (TimeoutError, RayError, RayServeException) as error:
+            for answer in asked:  # nobody waits for them any more
+                with suppress(RayError, RayServeException):  # which is what it would have answered
+                    answer.cancel()
             raise UnavailableError(
                 "one of those that administer is away, so its jobs cannot be listed: try again, or ask for those of "
-                "one domain"
+                "one domain",
+                retry_after_s=AWAY_S,
             ) from error
         return ListPage.of(sorted(numbered, key=lambda entry: entry[0], reverse=True), limit)

@@ -12,6 +12,7 @@ from ray.serve.handle import DeploymentHandle
 T = TypeVar("T")
 
 WATCH_S = 2.0
+BRIEFLY_S = 5.0  # that an answer may take for which others should not wait
 AWAY_S = 2  # that who is told to come again should wait
 
 
@@ -72,6 +73,13 @@ class Backend:
         except BaseException:
             response.cancel()
             raise
+
+    async def ask_briefly(self, method: str, *arguments: Any) -> Any:
+        """As `ask`; who does not answer soon, though the process has not ended, is gone too."""
+        try:
+            return await asyncio.wait_for(self.ask(method, *arguments), BRIEFLY_S)
+        except TimeoutError as error:
+            raise Gone from error
 
     async def stream(self, method: str, *arguments: Any) -> AsyncGenerator[Any]:
         """A long answer in its parts; raises Gone as `ask`, or where it breaks off."""

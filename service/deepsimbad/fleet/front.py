@@ -16,10 +16,10 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from deepsimbad.api.keys import KeyRing, needed_scope, presented_key
+from deepsimbad.api.keys import KeyRing, check_reach, needed_scope, presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
-from deepsimbad.errors import DeepSimbadError, UnauthorizedError, UnavailableError
+from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
 from deepsimbad.fleet.administrators import Administrators
 from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
 from deepsimbad.fleet.bodies import Bodies
@@ -202,15 +202,16 @@ class Front:
 
     async def _asked(self, backends: Sequence[Backend], scope: Scope) -> list[list[Message]]:
         """The answers of those that are there."""
-        asked = (backend.ask("ask", scope, b"") for backend in backends)
+        asked = (backend.ask_briefly("ask", scope, b"") for backend in backends)
         return [answer for answer in await asyncio.gather(*asked, return_exceptions=True) if isinstance(answer, list)]
 
     async def _before_last(self, message: Message, backend: Backend) -> None:
         """Before an answer of one that administers is whole, let all others see what it may have changed."""
         administering = self._administrators.backends
         if backend in administering and message["type"] == "http.response.body" and not message.get("more_body", False):
-            others = [each for each in (*administering, *self._replicas) if each is not backend]
-            await asyncio.gather(*(other.ask("follow") for other in others), return_exceptions=True)
+            following = [each.ask_briefly("follow") for each in administering if each is not backend]
+            following += [replica.ask("follow") for replica in self._replicas]  # who may have a large map to load
+            await asyncio.gather(*following, return_exceptions=True)
 
     async def _who(self, scope: Scope) -> tuple[Sequence[Backend], float]:
         """Who may answer, the better one first, and how many seconds it may be waited for; raises UnavailableError."""
@@ -224,14 +225,14 @@ class Front:
         return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls), _PATIENCE_S
 
     def _opens(self, scope: Scope) -> bool:
-        """Whether the key that is presented, if one is asked, has the scope that is needed."""
+        """Whether the key that is presented, if one is asked, reaches so far."""
         needed = needed_scope(scope["path"])
         try:
-            return (
-                needed is None or self._keys.is_open or self._keys.holder(presented_key(scope)).scope.includes(needed)
-            )
-        except (UnauthorizedError, UnavailableError):  # whoever is asked says so
+            if needed is not None and not self._keys.is_open:
+                check_reach(self._keys.holder(presented_key(scope)), scope["path"], needed)
+        except (UnauthorizedError, ForbiddenError, UnavailableError):  # whoever is asked says so
             return False
+        return True
 
 
 async def _refuse(scope: Scope, error: DeepSimbadError, receive: Receive, send: Send) -> None:
