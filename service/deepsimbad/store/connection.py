@@ -233,6 +233,8 @@ class GroupCommit:
         self._on_commit = on_commit
         self._waiting: SimpleQueue[list[_Write] | None] = SimpleQueue()
         self._of_this_turn: list[_Write] = []
+        self._is_crowded = False  # whether there were several at the last turn
+        self._is_idle = False
         self._is_open = True
         self._lock = threading.Lock()
         self.thread = threading.Thread(target=self._work, name="commits", daemon=True)
@@ -245,8 +247,9 @@ class GroupCommit:
 
         Args:
             run: The write.
-            by_turns: Whether it is handed over with all that the event loop submits so at this turn, where one runs
-                here: then it cannot be waited for before the turn ends.
+            by_turns: Whether it may be handed over with all that the event loop, where one runs here, submits so at
+                this turn, which it is while many are, or another transaction is under way: then it cannot be waited for
+                before the turn ends.
         """
         done: Future[T] = Future()
         done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
@@ -257,7 +260,8 @@ class GroupCommit:
         with self._lock:
             if not self._is_open:
                 raise UnavailableError("the service is shutting down")
-            if loop is None:
+            if loop is None or (self._is_idle and not self._is_crowded):
+                self._is_idle = False
                 self._waiting.put([(run, done)])
                 return done
             if not self._of_this_turn:
@@ -268,6 +272,7 @@ class GroupCommit:
     def _hand_over(self) -> None:
         with self._lock:
             self._waiting.put(self._of_this_turn)
+            self._is_crowded = len(self._of_this_turn) > 1
             self._of_this_turn = []
 
     def close(self) -> None:
@@ -280,7 +285,11 @@ class GroupCommit:
         self.thread.join()
 
     def _work(self) -> None:
-        while (writes := self._waiting.get()) is not None:
+        while True:
+            self._is_idle = self._waiting.empty()
+            writes = self._waiting.get()
+            if writes is None:
+                return
             batch = writes
             while len(batch) < MAX_BATCH and not self._waiting.empty():
                 writes = self._waiting.get()
