@@ -158,9 +158,9 @@ class Replica:
     def check_health(self) -> None:
         """Answered by the same event loop as everything else."""
 
-    def keys(self) -> Sequence[KeyRecord]:
+    async def keys(self) -> Sequence[KeyRecord]:
         """Every API key that was ever created."""
-        return self._services.catalog.keys()
+        return await asyncio.to_thread(self._services.catalog.keys)
 
     async def reread_keys(self) -> None:
         """Let the keys count as they are by now."""
