@@ -443,11 +443,9 @@ class Sessions:
             move = await self._worker.computed(move_on, is_short=is_short)
             is_written = True
             await asyncio.wrap_future(move.written)
-        except (
-            _NotSummedUp
-        ) as failed:  # the row counts all the same, and is on the disk before the session is read again
+        except _NotSummedUp as failed:
             live.state = None
-            await asyncio.wrap_future(failed.written)
+            await asyncio.wrap_future(failed.written)  # the row counts, and is there when the session is read again
             raise
         except BaseException as error:
             if is_written or not isinstance(error, DeepSimbadError | _CountedBefore):
