@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest, differences
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherFramesError, SourceError
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.recordings import Frame, Recording, spread
-from deepsimbad_client.recordings.left_out import LeftOut, shown
+from deepsimbad_client.recordings import Frame, LeftOut, Recording, shown, spread
 from deepsimbad_client.recordings.told import as_taken
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link

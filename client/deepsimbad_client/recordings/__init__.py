@@ -7,30 +7,35 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pictures
 
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits, measured
 from deepsimbad.evaluators.image import decode_deep as decode_file
 from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.image_files import ImageFile
-from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError, TooManyLeftOutError
 from deepsimbad_client.http import media_type_of
-from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, decode_heic
 
 Image = NDArray[np.uint8]  # [height, width, 3] BGR
 
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # as telephones write them; read by an optional library
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm"}) | HEIC_SUFFIXES
 TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 OTHER_SUFFIXES = frozenset(
     {".gif", ".jp2", ".j2k", ".avif", ".jxl", ".exr", ".hdr", ".tga", ".pbm", ".raw", ".dng", ".cr2", ".nef", ".arw"}
 )
 """Of images that are not read."""
+
+MOST_LEFT_OUT = 0.05  # of a recording's frames; more are accepted only where the caller says so
+NO_IMAGE = " without an image"  # of lines "in positions.csv", beside images "not in positions.csv"
 
 _N_PROBES, _N_SURE = 16, 3  # images that tell what all are; so many of 8 bits, and the others are too
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
@@ -178,7 +183,9 @@ def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[A
         if media_type_of(body) is not None:
             return decode_file(ImageFile.read(body, _MAX_PIXELS), as_stored=as_stored)
         if path.suffix.lower() in HEIC_SUFFIXES:
-            return decode_heic(body)
+            require_heic()
+            with Pictures.open(BytesIO(body)) as picture:
+                return np.ascontiguousarray(np.asarray(picture.convert("RGB"), dtype=np.uint8)[:, :, ::-1])
         image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:
         image = None
@@ -187,6 +194,17 @@ def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[A
     if image is None or image.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise BrokenFrameError(f"{path} is not an image that can be decoded", "undecodable")
     return np.asarray(image)
+
+
+def require_heic() -> None:
+    """Raises MissingExtraError where the library is not installed; where it is, Pillow opens such files from now on."""
+    try:
+        from pillow_heif import register_heif_opener  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise MissingExtraError(
+            "HEIC images need pillow-heif: pip install 'deep-simbad[heic]', or convert them to JPEG"
+        ) from error
+    register_heif_opener()
 
 
 def spread(n: int) -> list[int]:
@@ -261,3 +279,52 @@ def _shown_as(width: int, height: int, png: bytes) -> bytes:
     shape = Fraction(own_width * height, own_height * width)
     chunk = b"pHYs" + struct.pack(">IIB", shape.numerator, shape.denominator, 0)
     return png[:33] + struct.pack(">I", 9) + chunk + struct.pack(">I", zlib.crc32(chunk)) + png[33:]
+
+
+class LeftOut:
+    """Frames that are not used, reason -> their names: those a reader left out and those broken when they are read."""
+
+    def __init__(self, recording: Recording, *, allow_missing: bool) -> None:
+        """What the reader left out; raises as `add`."""
+        self.names = {reason: list(names) for reason, names in recording.left_out_names.items()}
+        self._recording, self._allow_missing = recording, allow_missing
+        n_by_reader = sum(map(len, self.names.values())) - _n_misspelt(self.names)
+        self._share = n_by_reader / max(1, recording.n_whole + n_by_reader)
+        self._check()
+
+    def add(self, reason: str, name: str) -> None:
+        """One more frame is broken. Raises TooManyLeftOutError (more than a twentieth of the recording is left out)."""
+        self.names.setdefault(reason, []).append(name)
+        self._share += 1 / len(self._recording.frames)
+        self._check()
+
+    def _check(self) -> None:
+        if self._allow_missing or self._share <= MOST_LEFT_OUT + 1e-9:
+            return
+        reasons = "; ".join(f"{len(names)} {reason} ({shown(names)})" for reason, names in self.names.items())
+        raise TooManyLeftOutError(
+            f"{self._share:.0%} of the frames of {self._recording.name} are left out: {reasons}; more than "
+            f"{MOST_LEFT_OUT:.0%} need --allow-missing"
+        )
+
+
+def _n_misspelt(names: Mapping[str, Sequence[str]]) -> int:
+    """How many images that a table does not name may be those of its lines that name no image."""
+    return sum(
+        min(len(lines), len(names.get(f"not {reason.removesuffix(NO_IMAGE)}", ())))
+        for reason, lines in names.items()
+        if reason.endswith(NO_IMAGE)
+    )
+
+
+def left_out_lines(names: Mapping[str, Sequence[str]], *, verbose: bool) -> list[str]:
+    """What is left out of a recording, reason -> names: a line a reason, with every name or the first of them."""
+    return [
+        f"left out: {len(frames)} {reason} ({shown(frames, len(frames) if verbose else 3)})"
+        for reason, frames in names.items()
+    ]
+
+
+def shown(names: Sequence[str], n_shown: int = 3) -> str:
+    """The first of some names."""
+    return ", ".join(names[:n_shown]) + (", ..." if len(names) > n_shown else "")

@@ -15,6 +15,7 @@ from PIL import UnidentifiedImageError
 from deepsimbad.core.camera import UPRIGHT_TURN
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import (
+    HEIC_SUFFIXES,
     IMAGE_SUFFIXES,
     OTHER_SUFFIXES,
     EncodedImage,
@@ -23,13 +24,13 @@ from deepsimbad_client.recordings import (
     decode_deep,
     read_file,
     ready,
+    require_heic,
+    shown,
     spread,
     stamp_of,
     with_grey_levels,
 )
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, TRACK_SUFFIXES, read_exif, read_track, utm, zone_remarks
-from deepsimbad_client.recordings.heic import HEIC_SUFFIXES, require_heic
-from deepsimbad_client.recordings.left_out import shown
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on

@@ -11,9 +11,8 @@ from rich.progress import Progress
 
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad_client.errors import InvalidArgumentError
-from deepsimbad_client.recordings import Recording, read_file
+from deepsimbad_client.recordings import MOST_LEFT_OUT, LeftOut, Recording, left_out_lines, read_file
 from deepsimbad_client.recordings.folder import single
-from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT, LeftOut, left_out_lines
 from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES, one_turn, open_source
 from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
 

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import Frame
-from deepsimbad_client.recordings.clock import FIRST_US
-from deepsimbad_client.recordings.left_out import MOST_LEFT_OUT
+from deepsimbad_client.recordings import MOST_LEFT_OUT, Frame
+from deepsimbad_client.recordings.names import FIRST_US
 from deepsimbad_client.recordings.track import (
     DEADBAND_M,
     SPIKE_SPEEDS,

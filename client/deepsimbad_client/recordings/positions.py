@@ -30,11 +30,9 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.frames import MAX_POSITION_M
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import Frame, finite_number
-from deepsimbad_client.recordings.clock import UNITS, UNKNOWN, times_us
+from deepsimbad_client.recordings import NO_IMAGE, Frame, finite_number
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm, zone_remarks
-from deepsimbad_client.recordings.left_out import NO_IMAGE
-from deepsimbad_client.recordings.names import Finder
+from deepsimbad_client.recordings.names import UNITS, UNKNOWN, Finder, times_us
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
 from deepsimbad_client.recordings.track import DEADBAND_M, track_of
 

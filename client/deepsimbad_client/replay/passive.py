@@ -13,8 +13,7 @@ from deepsimbad.core.route import Route
 from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
-from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.left_out import LeftOut
+from deepsimbad_client.recordings import LeftOut, Recording
 from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Seen, Viewer, write_lines
 
 TOLERANCE_M = 2.0

@@ -40,8 +40,7 @@ from deepsimbad.jobs.experiments.vpr import RANKS, VprConfig, VprReport, run_vpr
 from deepsimbad.jobs.fitting import Pictures, RecordingPictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import DEFAULT_TRAINING_EPISODES
-from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.left_out import left_out_lines
+from deepsimbad_client.recordings import Recording, left_out_lines
 from deepsimbad_client.recordings.sources import open_source
 
 _N_LANDMARKS = 300

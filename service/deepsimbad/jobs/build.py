@@ -30,8 +30,7 @@ from deepsimbad.evaluators.space import seen
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
-from deepsimbad_client.recordings import Frame, Recording, counted
-from deepsimbad_client.recordings.left_out import LeftOut
+from deepsimbad_client.recordings import Frame, LeftOut, Recording, counted
 from deepsimbad_client.recordings.told import as_taken
 
 Kept: TypeAlias = MutableMapping[str, tuple[NDArray[np.float32], bool]]

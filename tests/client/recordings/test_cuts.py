@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_client.errors import SourceError
-from deepsimbad_client.recordings import Frame, Recording
-from deepsimbad_client.recordings.left_out import LeftOut
+from deepsimbad_client.recordings import Frame, LeftOut, Recording
 from deepsimbad_client.recordings.sources import check_one_drive, one_turn, thinned
 
 

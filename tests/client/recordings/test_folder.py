@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from deepsimbad_client.errors import BrokenFrameError, InvalidArgumentError, SourceError, TooManyLeftOutError
-from deepsimbad_client.recordings.left_out import LeftOut
+from deepsimbad_client.recordings import LeftOut
 from deepsimbad_client.recordings.sources import open_source
 
 
