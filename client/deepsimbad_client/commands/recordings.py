@@ -33,6 +33,7 @@ from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_repla
 from deepsimbad_client.replay.passive import TOLERANCE_M
 from deepsimbad_client.replay.passive import replay as passive_replay
 from deepsimbad_client.replay.report import active_tables, summarise, summarise_active, table, write_page, write_summary
+from deepsimbad_client.replay.viewers import McapFile, RerunViewer
 from deepsimbad_client.replay.watch import watch_episode, watch_session
 
 IMAGE_EVALUATOR = {"kind": "feature_l2"}
@@ -288,12 +289,8 @@ def _viewers(rerun: bool, mcap: Path | None, open_ones: ExitStack) -> list[Viewe
     """What shows a replay; raises MissingExtraError, ReplayError (the file is there already)."""
     viewers: list[Viewer] = []
     if rerun:
-        from deepsimbad_client.replay.rerun_viewer import RerunViewer  # noqa: PLC0415 - an extra
-
         viewers.append(open_ones.enter_context(RerunViewer()))
     if mcap is not None:
-        from deepsimbad_client.replay.mcap_file import McapFile  # noqa: PLC0415 - an extra
-
         viewers.append(open_ones.enter_context(McapFile(mcap)))
     return viewers
 

@@ -1,7 +1,6 @@
 """Replays as other programs show them: an MCAP file read back by its library, and what Rerun is sent."""
 
 import base64
-import importlib
 import json
 import sys
 
@@ -13,6 +12,7 @@ from deepsimbad_client.commands import run
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.replay import viewers
 
 ANCHOR = {"lat_deg": 42.29, "lon_deg": -83.71, "bearing_deg": 0.0, "height_m": 270.0}
 N_FRAMES = 12
@@ -93,9 +93,8 @@ def test_episodes_of_an_active_replay_follow_each_other(client, seen_route, tmp_
 
 def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client, seen_route, tmp_path, monkeypatch):
     chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
-    viewer = importlib.import_module("deepsimbad_client.replay.rerun_viewer")
     path = tmp_path / "drive.rrd"
-    monkeypatch.setattr(viewer, "show_window", lambda stream, layout: stream.save(path, layout))
+    monkeypatch.setattr(viewers, "show_window", lambda stream, layout: stream.save(path, layout))
     assert replayed(client, seen_route, tmp_path / "out", "--rerun") == 0
     store = chunk.RrdReader(str(path)).store()
     paths = {str(each) for each in store.schema().entity_paths()}
@@ -108,12 +107,9 @@ def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client,
     assert {rows[f"/{path}"] for path in ("view", "moves", "world/belief", "world/next_move")} == {N_FRAMES}
 
 
-@pytest.mark.parametrize(("option", "module"), [("rerun", "rerun_viewer"), ("mcap", "mcap_file")])
-def test_without_the_library_one_line_says_what_to_install(
-    client, seen_route, tmp_path, monkeypatch, capsys, option, module
-):
+@pytest.mark.parametrize("option", ["rerun", "mcap"])
+def test_without_the_library_one_line_says_what_to_install(client, seen_route, tmp_path, monkeypatch, capsys, option):
     monkeypatch.setitem(sys.modules, {"rerun": "rerun", "mcap": "mcap.writer"}[option], None)
-    monkeypatch.delitem(sys.modules, f"deepsimbad_client.replay.{module}", raising=False)
     given = ["--rerun"] if option == "rerun" else ["--mcap", tmp_path / "x.mcap"]
     assert replayed(client, seen_route, tmp_path / "out", *given) == 1
     assert capsys.readouterr().err == (
