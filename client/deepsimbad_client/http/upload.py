@@ -1,7 +1,6 @@
 """Send a recording to a traverse, going on where an earlier attempt stopped."""
 
 import dataclasses
-import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,17 +12,15 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest, differences
+from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, content_digest, differences
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherFramesError, SourceError
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.recordings import Frame, LeftOut, Recording, shown, spread
+from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, shown, spread
 from deepsimbad_client.recordings.told import as_taken
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4
 UNUSABLE_IMAGE_CODES = frozenset({"undecodable_image", "truncated_image", "empty_body", "invalid_scene"})
-
-_UNKNOWN = {"timestamp_us": UNKNOWN_TIMESTAMP, "content_digest": UNKNOWN_CONTENT}
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -104,9 +101,10 @@ def upload(
         batch_size = max(1, BATCH_BYTES // max(1, 4 * recording.encodings.shape[1]))
         for start in range(0, len(rows), batch_size):
             batch = rows[start : start + batch_size]
-            values = recording.encodings[batch]
-            columns = _columns([recording.frames[row] for row in batch])
-            client.admin.put_frames(domain, traverse, encodings=values, replace=replace, **columns)
+            values, frames = recording.encodings[batch], [recording.frames[row] for row in batch]
+            names = [frame.name for frame in frames]
+            known = columns_of(frames)
+            client.admin.put_frames(domain, traverse, encodings=values, name=names, replace=replace, **known)
             report.n_sent += len(batch)
             report.bytes_sent += values.nbytes
             tell()
@@ -140,8 +138,7 @@ class Comparison:
         frames = [recording.frames[row] for row in self.rows]
         at = [row_of[frame.index] for frame in frames]
         self._stored = {name: known[name][at] for name in IDENTITY}
-        own = {name: [_UNKNOWN.get(name, math.nan)] * len(frames) for name in IDENTITY} | _columns(frames)
-        self._own = {name: np.array(own[name], self._stored[name].dtype) for name in IDENTITY}
+        self._own = {**columns_of(frames), "content_digest": np.full(len(frames), UNKNOWN_CONTENT, np.uint64)}
 
     def reading(
         self, input_size: tuple[int, int] | None, concurrency: int, places: Sequence[int] | None = None
@@ -285,18 +282,3 @@ def _send_image(
             raise
         return f"refused by the service as {error.code}"
     return len(image.body)
-
-
-def _columns(frames: Sequence[Frame]) -> dict[str, Any]:
-    """What is known of frames, as a batch tells it; one of which something is unknown has -1 or NaN for it."""
-    columns: dict[str, Any] = {
-        "index": [frame.index for frame in frames],
-        "name": [frame.name for frame in frames],
-        "position_m": [frame.position_m for frame in frames],
-    }
-    if any(frame.timestamp_us is not None for frame in frames):
-        columns["timestamp_us"] = [-1 if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
-    if any(frame.x_m is not None and frame.y_m is not None for frame in frames):
-        columns["x_m"] = [math.nan if frame.x_m is None else frame.x_m for frame in frames]
-        columns["y_m"] = [math.nan if frame.y_m is None else frame.y_m for frame in frames]
-    return columns

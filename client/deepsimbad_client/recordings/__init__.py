@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pictures
 
+from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits, measured
 from deepsimbad.evaluators.image import decode_deep as decode_file
@@ -52,6 +53,18 @@ class Frame:
     x_m: float | None = None  # first ground coordinate (NCLT: north)
     y_m: float | None = None  # second ground coordinate (NCLT: east)
     heading_rad: float | None = None  # in (-pi, pi], turning from x towards y
+
+
+def columns_of(frames: Sequence[Frame]) -> dict[str, Any]:
+    """What frames are known by, arrays [n] as a traverse has them: an unknown time is -1, an unknown coordinate NaN."""
+    times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
+    return {
+        "index": np.array([frame.index for frame in frames], np.int64),
+        "position_m": np.array([frame.position_m for frame in frames], np.float64),
+        "timestamp_us": np.array(times_us, np.int64),
+        "x_m": np.array([frame.x_m for frame in frames], np.float64),  # None becomes NaN
+        "y_m": np.array([frame.y_m for frame in frames], np.float64),
+    }
 
 
 @dataclass(frozen=True, slots=True)

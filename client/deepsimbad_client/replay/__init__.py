@@ -22,7 +22,7 @@ from deepsimbad_client.errors import (
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
-from deepsimbad_client.recordings import Recording
+from deepsimbad_client.recordings import Recording, columns_of
 from deepsimbad_client.recordings.told import as_taken
 
 Record = TypeVar("Record")
@@ -172,8 +172,8 @@ def changed_map(domain: str) -> ReplayError:
 
 def right_answers(recording: Recording, route: Route, within_m: float) -> list[NDArray[np.int64]]:
     """Right answers to each frame; of frames taken backwards as well, which still look forwards."""
-    columns = [[frame.position_m, frame.x_m, frame.y_m] for frame in recording.frames]
-    position_m, x_m, y_m = np.array(columns, np.float64).T
+    columns = columns_of(recording.frames)
+    position_m, x_m, y_m = (columns[name] for name in ("position_m", "x_m", "y_m"))
     order = np.argsort(position_m, kind="stable")
     knows_plane = bool(np.isfinite(x_m).any() and np.isfinite(y_m).any())
     plane = (x_m[order], y_m[order]) if knows_plane else (None, None)

@@ -18,7 +18,6 @@ from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.experience.training import LearningCurve, TrainingWorld, train
-from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
@@ -30,7 +29,7 @@ from deepsimbad.evaluators.space import seen
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
-from deepsimbad_client.recordings import Frame, LeftOut, Recording, counted
+from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, counted
 from deepsimbad_client.recordings.told import as_taken
 
 Kept: TypeAlias = MutableMapping[str, tuple[NDArray[np.float32], bool]]
@@ -102,13 +101,8 @@ def encode_recording(
     if not frames:
         raise InvalidSourceError(f"{recording.name} has no frame that can be used: {counted(left_out.names)}")
 
-    times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
     drive = Drive(
-        index=np.array([frame.index for frame in frames], np.int64),
-        position_m=np.array([frame.position_m for frame in frames], np.float64),
-        timestamp_us=np.array(times_us, np.int64),
-        x_m=np.array([np.nan if frame.x_m is None else frame.x_m for frame in frames], np.float64),
-        y_m=np.array([np.nan if frame.y_m is None else frame.y_m for frame in frames], np.float64),
+        **columns_of(frames),
         frame_name=np.array([text_of(frame.name) for frame in frames]),
         encodings=encodings,
         weights_sha256=weights_sha256,
