@@ -290,6 +290,11 @@ def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | N
     return true_images_of(test.route(), training.route(), tolerance_m)
 
 
+def kept_in(out: Path) -> str:
+    """What a Ctrl-C leaves of an experiment that keeps what it has done."""
+    return f"; the same command goes on where it stopped ({out} keeps what is done)"
+
+
 def tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:
     """Where `--json` is standard output, that holds nothing else; warnings go to standard error."""
     for warning in document.get("warnings", ()):

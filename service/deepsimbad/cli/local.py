@@ -1,7 +1,7 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import click
@@ -30,7 +30,7 @@ from deepsimbad.engine.localizer import localize as localize_view
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.worker import EvaluatorPool, Stopwatch
-from deepsimbad.errors import CancelledError, DeepSimbadError
+from deepsimbad.errors import DeepSimbadError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.grey_levels import levels_in
@@ -155,7 +155,8 @@ def map_(
             record = catalog.set_options(domain, {"thumbnails": thumbnails})
         shown = Pictures(settings.data_dir, settings.max_pixels) if record.options.get("thumbnails") else None
         stages = _stages(config, recordings, measure, keeps_pictures=shown is not None)
-        with _nothing_kept(after_cancel), progress_bar(stages, f"map {domain}") as progress:
+        leaves = f"; no map was made, and the same command {after_cancel}"
+        with progress_bar(stages, f"map {domain}", leaves=leaves) as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded = encode_recording(
@@ -210,15 +211,6 @@ def _stages(
     return reading | remap_stages(
         config, n_frames["training"], n_frames.get("landmarks", 0), dim, learns(measure, config.relevance)
     )
-
-
-@contextmanager
-def _nothing_kept(after_cancel: str) -> Iterator[None]:
-    """Say what a Ctrl-C leaves."""
-    try:
-        yield
-    except CancelledError as error:
-        raise CancelledError(f"{error}; no map was made, and the same command {after_cancel}") from error
 
 
 @click.command()

@@ -15,12 +15,12 @@ from typing import Any
 import click
 from rich.table import Table
 
-from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, json_file_option, tell, tolerance_option
+from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, json_file_option, kept_in, tell, tolerance_option
 from deepsimbad.cli.paper_page import write_report
 from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar
 from deepsimbad.core.composed import MOST_DIMENSIONS
 from deepsimbad.core.drive import Drive
-from deepsimbad.errors import CancelledError, InvalidSourceError
+from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
@@ -99,50 +99,46 @@ def paper(
     not_run = ["-".join(triplet) for triplet in TRIPLETS if triplet not in triplets]
     _tell_plan(recordings, missing, not_run, (encode_s + measure_s) / available_cores(), out)
     made_of = {"weights": measure.weights_sha256, **evaluator.as_dict(), **reading}
-    try:
-        with progress_bar({"encode": encode_s + 1, "measure": measure_s, "write": 2.0}, "paper") as progress:
-            progress.stage("encode")
-            encoded = _encoded(recordings, measure, settings.max_pixels, out, made_of, progress.update)
-            drives = {season: each.drive for season, each in encoded.items()}
-            progress.stage("measure")
-            results = measure_paper(
-                *(config, measure, drives, out / "results", {"evaluator": evaluator.as_dict()}),
-                _telling(progress.update),
-                {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
-            )
-            progress.stage("write")
-            widths = measure.halves or (next(iter(drives.values())).encoding_dim,)
-            document = {
-                **paper_document(config, results),
-                "seasons": {
-                    season: {
-                        "date": SEASONS[season],
-                        "n_frames": drive.n_frames,
-                        "length_m": float(drive.position_m[-1] - drive.position_m[0]),
-                        "left_out": encoded[season].left_out,
-                        "encode_ms": encoded[season].encode_ms,
-                        "trajectory": _trajectory(drive),
-                    }
-                    for season, drive in drives.items()
-                },
-                "missing": missing,
-                "not_run": not_run,
-                "config": {
-                    **asdict(config),
-                    "nclt": str(root),
-                    "evaluator": evaluator.as_dict(),
-                    **{name: value for name, value in reading.items() if value is not None},
-                },
-                "bits_per_encoding": 8 * bytes_per_encoding(next(iter(drives.values()))),
-                "bits_per_unit_vector": 32 * sum(min(MOST_DIMENSIONS, width) for width in widths),
-                "machine": machine(),
-                "release": release(),
-            }
-            document["files"] = [str(file) for file in write_report(out, document)]
-    except CancelledError as error:
-        raise CancelledError(
-            f"{error}; the same command goes on where it stopped ({out} keeps what is done)"
-        ) from error
+    stages = {"encode": encode_s + 1, "measure": measure_s, "write": 2.0}
+    with progress_bar(stages, "paper", leaves=kept_in(out)) as progress:
+        progress.stage("encode")
+        encoded = _encoded(recordings, measure, settings.max_pixels, out, made_of, progress.update)
+        drives = {season: each.drive for season, each in encoded.items()}
+        progress.stage("measure")
+        results = measure_paper(
+            *(config, measure, drives, out / "results", {"evaluator": evaluator.as_dict()}),
+            _telling(progress.update),
+            {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
+        )
+        progress.stage("write")
+        widths = measure.halves or (next(iter(drives.values())).encoding_dim,)
+        document = {
+            **paper_document(config, results),
+            "seasons": {
+                season: {
+                    "date": SEASONS[season],
+                    "n_frames": drive.n_frames,
+                    "length_m": float(drive.position_m[-1] - drive.position_m[0]),
+                    "left_out": encoded[season].left_out,
+                    "encode_ms": encoded[season].encode_ms,
+                    "trajectory": _trajectory(drive),
+                }
+                for season, drive in drives.items()
+            },
+            "missing": missing,
+            "not_run": not_run,
+            "config": {
+                **asdict(config),
+                "nclt": str(root),
+                "evaluator": evaluator.as_dict(),
+                **{name: value for name, value in reading.items() if value is not None},
+            },
+            "bits_per_encoding": 8 * bytes_per_encoding(next(iter(drives.values()))),
+            "bits_per_unit_vector": 32 * sum(min(MOST_DIMENSIONS, width) for width in widths),
+            "machine": machine(),
+            "release": release(),
+        }
+        document["files"] = [str(file) for file in write_report(out, document)]
     tell(document, json_file, lambda: _print(document))
 
 

@@ -17,7 +17,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.errors import UnavailableError, UnknownDomainError
+from deepsimbad.errors import CancelledError, UnavailableError, UnknownDomainError
 from deepsimbad.evaluators.registry import (
     EXTRACTOR_FORMS,
     EvaluatorConfig,
@@ -170,8 +170,8 @@ evaluators_option = click.option(  # or `all`; given on as EvaluatorConfigs
 
 
 @contextmanager
-def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
-    """A progress bar over weighted stages; Ctrl-C cancels at the next report."""
+def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -> Iterator[Progress]:
+    """A progress bar over weighted stages; Ctrl-C cancels at the next report, and what that leaves is said."""
     interrupted = False
 
     def interrupt(*_: object) -> None:
@@ -191,6 +191,8 @@ def progress_bar(stages: Mapping[str, float], title: str) -> Iterator[Progress]:
     try:
         with bars:
             yield Progress(stages, show, lambda: interrupted)
+    except CancelledError as error:
+        raise CancelledError(f"{error}{leaves}") from error
     finally:
         signal.signal(signal.SIGINT, before)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from deepsimbad.cli.experiment import json_file_option, tell, tolerance_option, true_images, usual_tolerance_m
+from deepsimbad.cli.experiment import json_file_option, kept_in, tell, tolerance_option, true_images, usual_tolerance_m
 from deepsimbad.cli.terminal import (
     data_dir_option,
     evaluator_option,
@@ -27,7 +27,7 @@ from deepsimbad.cli.terminal import (
 )
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
-from deepsimbad.errors import CancelledError, ImageTooLargeError, InvalidImageError
+from deepsimbad.errors import ImageTooLargeError, InvalidImageError
 from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
@@ -100,51 +100,45 @@ def try_(
     out = out or Path(re.sub(r"[^\w.-]+", "_", f"try-{names['database']}-{names['queries']}"))
     stages = {f"read {role}": len(recording.frames) / _FRAMES_A_SECOND for role, recording in recordings.items()}
     encoded: dict[str, EncodedRecording] = {}
-    try:
-        with progress_bar(stages | TRIAL_STAGES | {"pictures": 2.0}, "try") as progress:
-            for role, recording in recordings.items():
-                progress.stage(f"read {role}")
-                made_of = {
-                    "source": sources[role],
-                    "levels": recording.grey_levels,
-                    "weights": measure.weights_sha256,
-                    **evaluator.as_dict(),
-                    **reading,
-                }
-                with kept_encodings(out, role, **made_of) as kept:
-                    encoded[role] = encode_recording(
-                        *(recording, measure, settings.max_pixels, progress.update),
-                        kept=kept,
-                        allow_missing=allow_missing,
-                    )
-            drives = {role: each.drive for role, each in encoded.items()}
-            truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)
-            config = TrialConfig(tolerance_m, same_route=True if ground_truth is None else None)
-            ordered = (drives.get("landmarks"), drives["database"], drives["queries"])
-            pictures = RecordingPictures(recordings["landmarks" if landmarks else "database"], settings.max_pixels)
-            report = run_trial(config, measure, *ordered, truth, progress, pictures)
-            document = report.as_dict(
-                {
-                    **sources,
-                    "landmarks": landmarks,
-                    "ground_truth": None if ground_truth is None else str(ground_truth),
-                    "evaluator": evaluator.as_dict(),
-                    "spacing_m": reading["spacing_m"],
-                    "left_out": {role: each.left_out for role, each in encoded.items()},
-                }
-            )
-            others = {role: drive for role, drive in drives.items() if role != "queries"}
-            shown = [why for role in ("database", "queries") for why in drives[role].picture_warnings(f"of the {role}")]
-            document["warnings"] = [*known_drives(drives["queries"], **others), *report.warnings, *shown]
-            progress.stage("pictures")
-            places, views = (
-                Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries")
-            )
-            document["page"] = str(write_page(out / "index.html", document, report, places, views, progress.update))
-    except CancelledError as error:
-        raise CancelledError(
-            f"{error}; the same command goes on where it stopped ({out} keeps what is done)"
-        ) from error
+    stages |= TRIAL_STAGES | {"pictures": 2.0}
+    with progress_bar(stages, "try", leaves=kept_in(out)) as progress:
+        for role, recording in recordings.items():
+            progress.stage(f"read {role}")
+            made_of = {
+                "source": sources[role],
+                "levels": recording.grey_levels,
+                "weights": measure.weights_sha256,
+                **evaluator.as_dict(),
+                **reading,
+            }
+            with kept_encodings(out, role, **made_of) as kept:
+                encoded[role] = encode_recording(
+                    *(recording, measure, settings.max_pixels, progress.update),
+                    kept=kept,
+                    allow_missing=allow_missing,
+                )
+        drives = {role: each.drive for role, each in encoded.items()}
+        truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)
+        config = TrialConfig(tolerance_m, same_route=True if ground_truth is None else None)
+        ordered = (drives.get("landmarks"), drives["database"], drives["queries"])
+        pictures = RecordingPictures(recordings["landmarks" if landmarks else "database"], settings.max_pixels)
+        report = run_trial(config, measure, *ordered, truth, progress, pictures)
+        document = report.as_dict(
+            {
+                **sources,
+                "landmarks": landmarks,
+                "ground_truth": None if ground_truth is None else str(ground_truth),
+                "evaluator": evaluator.as_dict(),
+                "spacing_m": reading["spacing_m"],
+                "left_out": {role: each.left_out for role, each in encoded.items()},
+            }
+        )
+        others = {role: drive for role, drive in drives.items() if role != "queries"}
+        shown = [why for role in ("database", "queries") for why in drives[role].picture_warnings(f"of the {role}")]
+        document["warnings"] = [*known_drives(drives["queries"], **others), *report.warnings, *shown]
+        progress.stage("pictures")
+        places, views = (Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries"))
+        document["page"] = str(write_page(out / "index.html", document, report, places, views, progress.update))
     for role, each in encoded.items():
         tell_left_out(each.left_out_names, role, verbose=verbose)
     tell(document, json_file, lambda: _print(document, report))
