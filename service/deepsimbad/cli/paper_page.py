@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from deepsimbad.cli.terminal import write_html, write_json
-from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL
+from deepsimbad.core.planners import DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.jobs.experiments.paper import Document
-from deepsimbad.jobs.experiments.paper_report import HOLDS
+from deepsimbad.jobs.experiments.paper_report import HOLDS, shown_name
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, RANKS
 
 # As the paper says them, and ours; and which of the page's colours each has
@@ -52,7 +52,7 @@ def write_report(out: Path, document: Document) -> list[Path]:
             for triplet, each in document["by_triplet"].items()
         },
         panels=_panels(document),
-        planner_name=planner_name,
+        shown_name=shown_name,
         trajectories=_trajectories(document["seasons"]),
         rows=list(_method_rows(document)),
         encode_ms=_encode_ms(document),
@@ -138,13 +138,6 @@ def _panels(document: Document) -> list[dict[str, Any]]:
             }
         )
     return panels
-
-
-def planner_name(name: str) -> str:
-    """As the page says it."""
-    if name.startswith(f"{CONSTANT}_"):
-        return f"{name.removeprefix(f'{CONSTANT}_')} m"
-    return {NNQL: "NNQL"}.get(name, name)
 
 
 def _trajectories(seasons: Mapping[str, Document]) -> dict[str, Any] | None:
@@ -240,7 +233,7 @@ def markdown(document: Document) -> Iterator[str]:
             (
                 *(each["claim"], each["said_by"], each["verdict"]),
                 ", ".join(
-                    f"{METHODS.get(name, planner_name(name))} {value:.2f}" for name, value in each["values"].items()
+                    f"{METHODS.get(name, shown_name(name))} {value:.2f}" for name, value in each["values"].items()
                 ),
                 f"{each['n_agree']} of {each['n_triplets']}",
                 _interval(each["difference"], "stretches"),
@@ -291,7 +284,7 @@ def markdown(document: Document) -> Iterator[str]:
         (*titles, "mean move, m"),
         (
             (
-                *(planner_name(name), _mean(active["paper"][name]), _interval(active["paper"][name], "stretches")),
+                *(shown_name(name), _mean(active["paper"][name]), _interval(active["paper"][name], "stretches")),
                 *(_mean(ours), _interval(ours, "stretches"), _mean(active["views"][name])),
                 f"{document['wrong_when_confident'][name]:.1f}",
                 f"{document['mean_move_m']['ours'][name]:.1f}",

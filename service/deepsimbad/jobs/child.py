@@ -99,24 +99,16 @@ def main() -> None:
     logging.getLogger("deepsimbad").setLevel(order["log_level"])
     logging.captureWarnings(True)
 
-    from deepsimbad.errors import DeepSimbadError  # noqa: PLC0415 - nothing heavy before the priority is low
-    from deepsimbad.evaluators.compute import Compute, Device, Runtime  # noqa: PLC0415
-    from deepsimbad.jobs.runner import InThisProcess  # noqa: PLC0415
-    from deepsimbad.store.records import JobRecord, JobState  # noqa: PLC0415
+    from pydantic import TypeAdapter  # noqa: PLC0415 - nothing heavy before the priority is low
 
-    job = JobRecord(**{**order["job"], "state": JobState(order["job"]["state"])})
-    compute = order["compute"]
-    run_job = InThisProcess(
-        Path(order["data_dir"]),
-        order["n_threads"],
-        Compute(
-            Runtime(compute["runtime"]),
-            Device(compute["device"]),
-            compute["n_threads"],
-            compute["largest_batch"],
-            Path(compute["weights_dir"]),
-        ),
-    )
+    from deepsimbad.errors import DeepSimbadError  # noqa: PLC0415
+    from deepsimbad.evaluators.compute import Compute  # noqa: PLC0415
+    from deepsimbad.jobs.runner import InThisProcess  # noqa: PLC0415
+    from deepsimbad.store.records import JobRecord  # noqa: PLC0415
+
+    job = TypeAdapter(JobRecord).validate_python(order["job"])
+    compute = TypeAdapter(Compute).validate_python(order["compute"])
+    run_job = InThisProcess(Path(order["data_dir"]), order["n_threads"], compute)
     try:
         result = run_job(job, lambda state: _tell(progress=vars(state)), cancelled.is_set)
     except DeepSimbadError as error:

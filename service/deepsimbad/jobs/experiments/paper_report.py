@@ -148,13 +148,13 @@ def _claims_of_views(pooled: Pooled, at: Mapping[str, Document], seed: int) -> l
 
     brute, rrf, ours = Relevance.BRUTE_FORCE.value, Relevance.RRF.value, DEFAULT_RELEVANCE.value
     claims = [judged("Brute force beats RRF", brute, rrf)]
-    claims += [judged(f"RRF beats {_shown(each)}", rrf, each) for each in _FELL_BEHIND]
+    claims += [judged(f"RRF beats {shown_name(each)}", rrf, each) for each in _FELL_BEHIND]
     for name in _FELL_BEHIND:
         figure = pooled.figures(seed)[name]
         low, high = figure["stretches"]
         claims.append(
             {
-                "claim": f"{_shown(name)[0].upper()}{_shown(name)[1:]} is as bad as chance",
+                "claim": f"{shown_name(name)[0].upper()}{shown_name(name)[1:]} is as bad as chance",
                 "said_by": "paper",
                 "values": {name: figure["mean"], "chance": _CHANCE},
                 "difference": {"mean": figure["mean"] - _CHANCE, "stretches": [low - _CHANCE, high - _CHANCE]},
@@ -164,7 +164,7 @@ def _claims_of_views(pooled: Pooled, at: Mapping[str, Document], seed: int) -> l
                 "why": "",
             }
         )
-    claims += [judged(f"Composed beats {_shown(each)}", ours, each, "us") for each in (rrf, brute)]
+    claims += [judged(f"Composed beats {shown_name(each)}", ours, each, "us") for each in (rrf, brute)]
     if claims[0]["verdict"] != HOLDS and pooled.mean(BRUTE_FORCE_U) < pooled.mean(brute):
         claims[0]["why"] = (
             f"Brute force errs by what a season shifts and scales: with every number standardised by its own drive the "
@@ -192,10 +192,10 @@ def _claims_of_moves(moves: Mapping[str, Pooled], active: Mapping[str, Document]
     move_m = float(np.mean([each["mean_move_m"]["paper"][NNQL] for each in active.values()]))
     claims = [
         judged("NNQL beats random moves", "paper", NNQL, RANDOM),
-        judged(f"NNQL beats the best constant move, {_shown(best)}", "paper", NNQL, best),
+        judged(f"NNQL beats the best constant move, {shown_name(best)}", "paper", NNQL, best),
         judged("Informed needs fewer views than random moves", "views", DEFAULT_PLANNER, RANDOM, "us"),
         judged(
-            f"Informed needs fewer views than the best constant move, {_shown(soonest)}",
+            f"Informed needs fewer views than the best constant move, {shown_name(soonest)}",
             *("views", DEFAULT_PLANNER, soonest, "us"),
         ),
     ]
@@ -212,8 +212,8 @@ def _claims_of_moves(moves: Mapping[str, Pooled], active: Mapping[str, Document]
 _FELL_BEHIND = (Relevance.BAG_OF_LANDMARKS.value, Relevance.SIMBAD.value)
 
 
-def _shown(name: str) -> str:
-    """A method's name as a sentence has it."""
+def shown_name(name: str) -> str:
+    """A method's or a planner's name as a sentence has it."""
     if name.startswith(f"{CONSTANT}_"):
         return f"{name.removeprefix(f'{CONSTANT}_')} m"
-    return {"rrf": "RRF", "simbad": "SIMBAD"}.get(name, name.replace("_", " "))
+    return {"rrf": "RRF", "simbad": "SIMBAD", NNQL: "NNQL"}.get(name, name.replace("_", " "))
