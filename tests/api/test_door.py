@@ -13,7 +13,7 @@ from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import error_response
 from deepsimbad.errors import BodyTooLargeError, OverloadedError
 from deepsimbad.settings import Settings
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey
 from deepsimbad.store.records import KeyScope
 
 from .conftest import ring_of

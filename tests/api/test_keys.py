@@ -9,7 +9,7 @@ import pytest
 from deepsimbad.api import keys
 from deepsimbad.api.keys import KEPT_S, KeyRing, RateLimit, presented_key
 from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey
 from deepsimbad.store.records import KeyScope
 
 from .conftest import ring_of

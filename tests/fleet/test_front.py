@@ -10,7 +10,7 @@ import pytest
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.errors import UnavailableError
 from deepsimbad.settings import Settings
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey
 from deepsimbad.store.records import KeyRecord, KeyScope
 
 pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=ImportError)

@@ -27,8 +27,7 @@ from deepsimbad.errors import (
     UnknownMapVersionError,
 )
 from deepsimbad.store import durable
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey, Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.records import JobState, KeyScope, MapState, now
 from deepsimbad.store.traverses import Traverse

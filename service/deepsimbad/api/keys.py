@@ -13,7 +13,7 @@ from anyio.to_thread import run_sync
 from starlette.types import Scope
 
 from deepsimbad.errors import ForbiddenError, RateLimitedError, UnauthorizedError, UnavailableError
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey
 from deepsimbad.store.records import KeyRecord, KeyScope, now
 
 log = logging.getLogger(__name__)

@@ -23,8 +23,7 @@ from deepsimbad.cli.terminal import (
 )
 from deepsimbad.errors import DeepSimbadError, UnknownKeyError
 from deepsimbad.settings import unknown_variables, variable_of
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey, Catalog
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.records import KeyRecord, KeyScope, now
 

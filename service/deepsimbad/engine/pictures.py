@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.map import Map
 from deepsimbad.errors import UnknownThumbnailError
 from deepsimbad.evaluators.image import thumbnail
-from deepsimbad.store.thumbnails import Thumbnails
+from deepsimbad.store.pictures import Thumbnails
 
 _MOST_VIEWS = 32  # of sessions, the latest
 _MOST_VIEW_BYTES = 64 << 20  # of all of them

@@ -26,7 +26,7 @@ from deepsimbad.fleet.bodies import Bodies
 from deepsimbad.fleet.placement import place
 from deepsimbad.fleet.replica import Replica, keys_of
 from deepsimbad.settings import Settings
-from deepsimbad.store.catalog_keys import ApiKey
+from deepsimbad.store.catalog import ApiKey
 
 _PASSED = (  # of a request's scope
     *("type", "asgi", "http_version", "method", "path", "raw_path", "query_string", "headers"),

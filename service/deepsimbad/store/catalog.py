@@ -1,6 +1,12 @@
 """The catalog: which domains, map versions, jobs and keys there are, and which version serves."""
 
+import hashlib
+import json
+import re
+import secrets
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,24 +16,22 @@ from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
     DomainDiffersError,
+    InvalidInputError,
     TooManyDomainsError,
     TraverseInUseError,
+    UnknownKeyError,
 )
 from deepsimbad.store import layout
 from deepsimbad.store.catalog_jobs import JobCatalog
-from deepsimbad.store.catalog_keys import KeyCatalog
 from deepsimbad.store.catalog_maps import MapCatalog
 from deepsimbad.store.connection import open_working_file
-from deepsimbad.store.durable import (
-    bury,
-    empty_graves,
-    make_data_dir,
-    storage_faults,
-    sync,
-)
+from deepsimbad.store.durable import bury, empty_graves, make_data_dir, storage_faults, sync
 from deepsimbad.store.records import (
     DomainRecord,
+    KeyRecord,
+    KeyScope,
     ListPage,
+    after,
     from_json,
     get_domain,
     now,
@@ -36,8 +40,42 @@ from deepsimbad.store.records import (
 )
 from deepsimbad_migrations.catalog.migrations import migrations
 
+_KEY = re.compile(r"dsk_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+_KEY_ID = re.compile(r"[0-9a-f]{12}")
+_MAX_NAME = 100  # of a key
+_SELECT_KEY = "SELECT key_id, name, scope, secret_sha256, domains, created_at, expires_at, revoked_at FROM api_key"
 
-class Catalog(MapCatalog, JobCatalog, KeyCatalog):
+
+@dataclass(frozen=True)
+class ApiKey:
+    """A key as its holder has it; its id, twelve hexadecimal digits, may be shown and logged, its secret not."""
+
+    key_id: str
+    secret: str = field(repr=False)  # 256 random bits in 43 letters
+
+    @classmethod
+    def new(cls) -> Self:
+        """A key that nobody has had before."""
+        return cls(secrets.token_hex(6), secrets.token_urlsafe(32))
+
+    @classmethod
+    def parse(cls, text: str) -> Self | None:
+        """The key that a text is; None where it has not the form of one."""
+        match = _KEY.fullmatch(text)
+        return None if match is None else cls(*match.groups())
+
+    @property
+    def text(self) -> str:
+        """What its holder sends."""
+        return f"dsk_{self.key_id}_{self.secret}"
+
+    @property
+    def secret_sha256(self) -> str:
+        """What is stored of the secret. It is random, so that a fast digest gives nothing away."""
+        return hashlib.sha256(self.secret.encode()).hexdigest()
+
+
+class Catalog(MapCatalog, JobCatalog):
     """The one file that says what is true of a data directory; usable from any thread and several processes.
 
     Every change is one transaction: a crash at any moment leaves the state before it or after it. Every method raises
@@ -213,3 +251,58 @@ class Catalog(MapCatalog, JobCatalog, KeyCatalog):
                 lines.append(f"removed the folder of the deleted domain {name}")
         empty_graves(layout.domains_folder(self.data_dir))
         return lines
+
+    # API keys. Rows are never deleted: whether a key was ever created decides whether the service runs open.
+
+    def create_key(
+        self,
+        scope: KeyScope,
+        name: str = "",
+        lifetime: timedelta | None = None,
+        domains: Sequence[str] | None = None,
+    ) -> tuple[KeyRecord, ApiKey]:
+        """Make an API key; its secret is returned here and can never be had again.
+
+        Where `lifetime` is None it does not expire, where `domains` is None it opens all; they need not exist yet.
+        Raises InvalidInputError where the name, the lifetime or the domains cannot be kept.
+        """
+        if len(name) > _MAX_NAME or not name.isprintable():
+            raise InvalidInputError(f"a key is named by at most {_MAX_NAME} printable letters")
+        if lifetime is not None and lifetime <= timedelta(0):
+            raise InvalidInputError("a key lives for more than no time at all")
+        if domains is not None and scope is KeyScope.ADMIN:
+            raise InvalidInputError("a key of scope admin opens every domain")
+        listed = None if domains is None else json.dumps([layout.checked_name(domain, "domain") for domain in domains])
+        expires_at = None if lifetime is None else after(lifetime)
+        key = ApiKey.new()
+        row = {"key_id": key.key_id, "name": name, "scope": scope, "secret_sha256": key.secret_sha256}
+        with self._writing() as db:
+            db.table("api_key").insert({**row, "domains": listed, "created_at": now(), "expires_at": expires_at})
+            return _get_key(db, key.key_id), key
+
+    def keys(self) -> list[KeyRecord]:
+        """Every API key that was ever created, revoked ones too, oldest first."""
+        with self._reading() as db:
+            return [_key(row) for row in db.execute(f"{_SELECT_KEY} ORDER BY rowid")]
+
+    def revoke_key(self, key_id: str) -> KeyRecord:
+        """Let a key open nothing any more; one that was revoked stays so since then. Raises UnknownKeyError."""
+        with self._writing() as db:
+            if _get_key(db, key_id).revoked_at is None:
+                db.table("api_key").update(key_id, {"revoked_at": now()})
+            return _get_key(db, key_id)
+
+
+def _get_key(db: Database, key_id: str) -> KeyRecord:
+    row = None
+    if _KEY_ID.fullmatch(key_id):  # other text cannot be one, and need not be valid Unicode either
+        row = db.execute(f"{_SELECT_KEY} WHERE key_id = ?", [key_id]).fetchone()
+    if row is None:
+        raise UnknownKeyError(f"there is no key {key_id!a}: `deepsimbad keys list` shows them")
+    return _key(row)
+
+
+def _key(row: tuple[Any, ...]) -> KeyRecord:
+    key_id, name, scope, secret_sha256, domains, *times = row
+    opened = None if domains is None else tuple(json.loads(domains))
+    return KeyRecord(key_id, name, KeyScope(scope), secret_sha256, opened, *times)

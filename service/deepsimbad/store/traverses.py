@@ -43,8 +43,8 @@ from deepsimbad.store.connection import (
     write_transaction,
 )
 from deepsimbad.store.durable import lock_folder, remove_database, storage_faults, sync
+from deepsimbad.store.pictures import Spool, clear_spool, spool_pictures, spooled
 from deepsimbad.store.records import now, to_json
-from deepsimbad.store.spool import Spool, clear_spool, spool_pictures, spooled
 from deepsimbad_migrations.traverse.migrations import migrations
 
 _ROWS_AT_ONCE = 1024

@@ -29,7 +29,7 @@ from deepsimbad.jobs.experiments.calibration import (
     views_until_found,
     wrong_when_confident,
 )
-from deepsimbad.jobs.experiments.episodes import TestDrive as DrivenByTest
+from deepsimbad.jobs.experiments.nbv import TestDrive as DrivenByTest
 from deepsimbad.jobs.progress import Progress
 
 QUICK = CalibrationConfig(n_landmarks=60, standing=3, carried=12)

@@ -8,8 +8,8 @@ import pytest
 
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.route import Route
-from deepsimbad.jobs.experiments.episodes import EpisodeRunner, clairvoyant_chooser, follow_plan, random_chooser
-from deepsimbad.jobs.experiments.episodes import TestDrive as Drive
+from deepsimbad.jobs.experiments.nbv import EpisodeRunner, clairvoyant_chooser, follow_plan, random_chooser
+from deepsimbad.jobs.experiments.nbv import TestDrive as Drive
 
 
 @dataclass

@@ -7,8 +7,7 @@ import pytest
 
 from deepsimbad.errors import CancelledError, InvalidMapConfigError
 from deepsimbad.jobs.build import encode_recording
-from deepsimbad.jobs.experiments.episodes import Episode
-from deepsimbad.jobs.experiments.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
+from deepsimbad.jobs.experiments.nbv import Episode, NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.progress import Progress
 from deepsimbad_client.recordings.sources import open_source
 

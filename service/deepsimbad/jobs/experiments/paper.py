@@ -23,14 +23,15 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import measured, views_of
-from deepsimbad.jobs.experiments.episodes import Episode, TestDrive
 from deepsimbad.jobs.experiments.kept import KeptResults, code_digest, drive_digest
 from deepsimbad.jobs.experiments.nbv import (
     BLOCK_M,
     CLAIRVOYANT,
+    Episode,
     NbvConfig,
     NbvReport,
     Setup,
+    TestDrive,
     drive_planner,
     planner_names,
     starts_of,
