@@ -226,17 +226,11 @@ class SessionState(Answer):
     next_best_view: NextBestView | None = None
 
 
-class SessionAnswer(Answer):
+class SessionAnswer(Localization):
     """The answer to one observation of a session: the belief over all its views so far, and the move to make next."""
 
-    map_version: int
-    timings_ms: dict[str, float]
     n_observations: int | None = None
-    belief: Belief
-    informative: bool = True  # whether the view told anything
-    warnings: tuple[str, ...] = ()  # what a person should know, in sentences
     retrieval: tuple[Retrieved, ...] = ()
-    next_best_view: NextBestView | None = None
 
 
 class ListedSession(Answer):

@@ -20,7 +20,7 @@ from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measured, views_of
 from deepsimbad.jobs.experiments.truth import nearest_images
-from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all
+from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all, told
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
@@ -91,16 +91,10 @@ class TrialReport:
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document, as `experiment vpr` has it."""
-        score = self.scores[DEFAULT_RELEVANCE.value]
         errors = [outcome.error_m for outcome in self.outcomes if outcome.error_m is not None]
         return {
-            "anr": {name: each.anr for name, each in self.scores.items()},
-            "recall_at_1": {name: each.recall_at[1] for name, each in self.scores.items()},
-            "recall_at_5": {name: each.recall_at[5] for name, each in self.scores.items()},
+            **told(self.scores, (1, 5)),
             "recall_at": {name: {str(n): r for n, r in each.recall_at.items()} for name, each in self.scores.items()},
-            "default": DEFAULT_RELEVANCE.value,
-            "n_queries": score.n_queries,
-            "n_left_out": score.n_left_out,
             "n_map_images": self.map.n_images,
             "n_landmarks": self.map.n_landmarks,
             "error_m": {"median": _quantile(errors, 0.5), "p90": _quantile(errors, 0.9)},

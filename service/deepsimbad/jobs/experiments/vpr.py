@@ -68,15 +68,8 @@ class VprReport:
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7."""
-        first = next(iter(self.scores.values()))
         return {
-            "anr": {name: score.anr for name, score in self.scores.items()},
-            "recall_at_1": {name: score.recall_at[1] for name, score in self.scores.items()},
-            "recall_at_5": {name: score.recall_at[5] for name, score in self.scores.items()},
-            "recall_at_10": {name: score.recall_at[10] for name, score in self.scores.items()},
-            "default": DEFAULT_RELEVANCE.value,
-            "n_queries": first.n_queries,
-            "n_left_out": first.n_left_out,
+            **told(self.scores, RANKS),
             "index_bits_per_map_image": self.index_bits_per_map_image,
             "passive": None if self.passive is None else self.passive.as_dict(),
             "second_season": None if self.same_route is None else self.same_route.as_dict(),
@@ -87,6 +80,18 @@ class VprReport:
             "seconds": self.seconds,
             **({} if self.fitting is None else {"fitting": dict(self.fitting)}),
         }
+
+
+def told(scores: Mapping[str, RetrievalScores], ranks: Sequence[int]) -> dict[str, Any]:
+    """Scores by relevance as results tell them, JSON-ready."""
+    first = next(iter(scores.values()))
+    return {
+        "anr": {name: score.anr for name, score in scores.items()},
+        **{f"recall_at_{k}": {name: score.recall_at[k] for name, score in scores.items()} for k in ranks},
+        "default": DEFAULT_RELEVANCE.value,
+        "n_queries": first.n_queries,
+        "n_left_out": first.n_left_out,
+    }
 
 
 def vpr_stages(config: VprConfig) -> dict[str, float]:
