@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import click
@@ -24,7 +23,7 @@ from deepsimbad.errors import InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.jobs.build import EncodedRecording, Kept, encode_recording
+from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments.kept import KeptResults, drive_digest, kept_encodings
 from deepsimbad.jobs.experiments.paper import (
     SEASONS,
@@ -45,7 +44,6 @@ from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
 from deepsimbad_client.recordings.options import opened, reading
 from deepsimbad_client.recordings.sources import NCLT_PREFIX
 
-_FRAMES_AT_ONCE = 500  # that a run which is killed may have to encode again
 _ENCODE_S = 0.05  # a frame, on one core of a server's
 _MOST_POINTS = 400  # of a trajectory as it is drawn
 
@@ -197,39 +195,19 @@ def _encoded(
     shares = Shares(
         lambda _, share: on_progress(share), {each: len(drive.frames) for each, drive in recordings.items()}
     )
-    encoded: dict[str, EncodedRecording] = {}
+    results, encoded = KeptResults(out / "results", made_of), dict[str, EncodedRecording]()
 
     def encode(season: str) -> None:
-        recording, report = recordings[season], shares.report(season)
-        all_kept: Kept = {}
-        encodes = partial(encode_recording, evaluator=evaluator, max_pixels=max_pixels)
-        n, date, took_ms = len(recording.frames), SEASONS[season], list[float | None]()
-        for first in range(0, n if recording.encodings is None else 0, _FRAMES_AT_ONCE):
-            part = recording.sliced(slice(first, first + _FRAMES_AT_ONCE))
-
-            def so_far(share: float, first: int = first, part: Recording = part) -> None:
-                report((first + share * len(part.frames)) / n)
-
-            with kept_encodings(out / "encodings", f"{date}-{first}", source=date, **made_of) as kept:
-                took_ms.append(encodes(part, kept=kept, on_progress=so_far).encode_ms)
-            all_kept.update(kept)
-        whole = encodes(recording, kept=all_kept, on_progress=lambda _: None)
-        encoded[season] = replace(whole, encode_ms=_encode_ms(out, season, whole.drive, took_ms, made_of))
+        report, date = shares.report(season), SEASONS[season]
+        with kept_encodings(out / "encodings", date, source=date, **made_of) as kept:
+            drive = encode_recording(recordings[season], evaluator, max_pixels, report, kept=kept)
+        of_drive = drive_digest(drive.drive)
+        took = results.get(f"{season}-encode", lambda: {"ms": drive.encode_ms}, digest=of_drive)  # of who encoded it
+        encoded[season] = replace(drive, encode_ms=took["ms"])
         report(1.0)
 
     in_threads([partial(encode, season) for season in recordings])
     return {season: encoded[season] for season in recordings}
-
-
-def _encode_ms(
-    out: Path, season: str, drive: Drive, took_ms: list[float | None], made_of: Mapping[str, Any]
-) -> float | None:
-    """Of the run that encoded."""
-    new = [ms for ms in took_ms if ms is not None]
-    kept = KeptResults(out / "results", made_of)
-    made = {"ms": median(new) if new else None}
-    took: float | None = kept.get(f"{season}-encode", lambda: made, digest=drive_digest(drive))["ms"]
-    return took
 
 
 def _trajectory(drive: Drive) -> list[list[float]]:

@@ -18,13 +18,7 @@ from typing import Any
 
 from sqlite_utils import Database, Migrations
 
-from deepsimbad.errors import (
-    ConflictError,
-    DamagedMapError,
-    DeepSimbadError,
-    InvalidArchiveError,
-    UnavailableError,
-)
+from deepsimbad.errors import ConflictError, DamagedMapError, DeepSimbadError, InvalidArchiveError, UnavailableError
 from deepsimbad.store import layout
 from deepsimbad.store.connection import check_integrity, in_todays_schema, look_at, pending_migrations
 from deepsimbad.store.durable import PRIVATE, service_lock, sha256_of, storage_faults, sync, verify, written_aside

@@ -20,16 +20,7 @@ from deepsimbad.errors import (
 from deepsimbad.store import layout
 from deepsimbad.store.connection import OpenFile, open_database
 from deepsimbad.store.durable import lock_folder, remove_database, sync, verify
-from deepsimbad.store.records import (
-    KeptMap,
-    ListPage,
-    MapRecord,
-    MapState,
-    from_json,
-    get_domain,
-    now,
-    to_json,
-)
+from deepsimbad.store.records import KeptMap, ListPage, MapRecord, MapState, from_json, get_domain, now, to_json
 
 _SELECT_MAP = """
     SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at,

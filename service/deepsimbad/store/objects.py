@@ -148,12 +148,7 @@ class Objects:
     @contextmanager
     def _faults(self, name: str) -> Iterator[None]:
         """Name what the library raises; FileNotFoundError and AlreadyExistsError go on, as answers."""
-        from obstore.exceptions import (  # noqa: PLC0415
-            AlreadyExistsError,
-            BaseError,
-            PermissionDeniedError,
-            UnauthenticatedError,
-        )
+        from obstore.exceptions import AlreadyExistsError, BaseError, PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
         try:
             yield

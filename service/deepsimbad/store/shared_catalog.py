@@ -496,15 +496,11 @@ def _state_of(db: Database, name: str) -> _State:
 
 def _maps(db: Database, name: str, state: str) -> list[dict[str, Any]]:
     """What the log says of a domain's versions, those that serve, or that served and may again."""
-    rows = db.execute(
+    rows = db.query(
         """
         SELECT version, created_at, sha256, file_bytes, config, metrics FROM map
         WHERE domain = ? AND state = ? AND removed_at IS NULL AND (shared OR state = 'active') ORDER BY version
         """,
         [name, state],
     )
-    columns = ("version", "created_at", "sha256", "file_bytes")
-    return [
-        {**dict(zip(columns, row[:4], strict=True)), "config": from_json(row[4]), "metrics": from_json(row[5])}
-        for row in rows
-    ]
+    return [{**row, "config": from_json(row["config"]), "metrics": from_json(row["metrics"])} for row in rows]

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from collections import UserDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,12 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import deepsimbad
 from deepsimbad.core.drive import Drive
 from deepsimbad.jobs.build import Kept
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad_client.recordings import stamp_of
+
+_WRITTEN_EVERY = 500  # frames, which a run that is killed may have to encode again
 
 
 @contextmanager
@@ -26,19 +30,44 @@ def kept_encodings(folder: Path, role: str, **made_of: Any) -> Iterator[Kept]:
         made_of: All that encodings depend on beside the images; another value, and nothing is kept. `source` is the
             recording, which may be one file.
     """
-    file = folder / f"{role}-encodings.npz"
     made_of["file"] = stamp_of(Path(made_of["source"].partition("#")[0]))
-    identity = json.dumps(made_of, sort_keys=True, default=str)
-    kept = _read(file, identity)
-    n_before = len(kept)
+    kept = _KeptInFile(folder / f"{role}-encodings.npz", json.dumps(made_of, sort_keys=True, default=str))
     try:
         yield kept
     finally:
-        if len(kept) > n_before:
-            _write(file, identity, kept)
+        kept.write()
 
 
-def _read(file: Path, identity: str) -> Kept:
+class _KeptInFile(UserDict[str, tuple[NDArray[np.float32], bool]]):
+    """As `Kept`, written back now and then too, for a run that is killed."""
+
+    def __init__(self, file: Path, identity: str) -> None:
+        super().__init__()
+        self.data = _read(file, identity)
+        self._file, self._identity, self._n_written = file, identity, len(self.data)
+
+    def __setitem__(self, stamp: str, frame: tuple[NDArray[np.float32], bool]) -> None:
+        super().__setitem__(stamp, frame)
+        if len(self) >= self._n_written + _WRITTEN_EVERY:
+            self.write()
+
+    def write(self) -> None:
+        """By another name first, so that what is there is always whole."""
+        if len(self) == self._n_written:
+            return
+        encodings = np.stack([encoding for encoding, _ in self.values()])
+        shows_nothing = np.array([is_blank for _, is_blank in self.values()])
+        encodings = encodings.astype(np.float16) if is_halvable(encodings) else encodings
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        part = self._file.with_suffix(".part")
+        with part.open("wb") as body:
+            identity, stamps = np.array(self._identity), np.array(list(self))
+            np.savez(body, identity=identity, stamps=stamps, encodings=encodings, shows_nothing=shows_nothing)
+        part.replace(self._file)
+        self._n_written = len(self)
+
+
+def _read(file: Path, identity: str) -> dict[str, tuple[NDArray[np.float32], bool]]:
     try:
         with np.load(file) as arrays:
             if str(arrays["identity"]) != identity:
@@ -47,19 +76,6 @@ def _read(file: Path, identity: str) -> Kept:
             return dict(zip(arrays["stamps"].tolist(), frames, strict=True))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return {}  # not there, or damaged: images are encoded again
-
-
-def _write(file: Path, identity: str, kept: Kept) -> None:
-    """By another name first, so that what is there is always whole."""
-    encodings = np.stack([encoding for encoding, _ in kept.values()])
-    shows_nothing = np.array([is_blank for _, is_blank in kept.values()])
-    encodings = encodings.astype(np.float16) if is_halvable(encodings) else encodings
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(".part")
-    with part.open("wb") as body:
-        stamps = np.array(list(kept))
-        np.savez(body, identity=np.array(identity), stamps=stamps, encodings=encodings, shows_nothing=shows_nothing)
-    part.replace(file)
 
 
 @dataclass(frozen=True)

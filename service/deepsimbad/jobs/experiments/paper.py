@@ -137,33 +137,24 @@ class Pair:
     def measure(self, kept: KeptResults, shares: Shares) -> dict[str, Document]:
         """Everything, or what is kept of it, by triplet."""
         config, results = self._config, {"-".join(triplet): dict[str, Any]() for triplet in self._triplets}
+
+        def keep(piece: str, triplet: Triplet, make: Callable[..., Document], **made_of: Any) -> Document:
+            digests, report = [self._digests[season] for season in triplet], shares.report(piece)
+            result = kept.get(piece.replace(" ", "-"), partial(make, triplet, report), drives=digests, **made_of)
+            report(1.0)
+            return result
+
+        vpr = {"config": asdict(config.vpr()), "tolerances_m": config.tolerances_m}
         for h in sorted(config.list_lengths, key=lambda h: h != config.list_length):
             for triplet in self._triplets:
-                made_of = {"config": asdict(config.vpr()), "tolerances_m": config.tolerances_m, "list_length": h}
-                make = partial(self._single_views, h, triplet, shares)
-                results["-".join(triplet)][str(h)] = self._kept(
-                    kept, shares, _piece(triplet, h), triplet, made_of, make
-                )
+                make = partial(self._single_views, h)
+                result = keep(_piece(triplet, h), triplet, make, **vpr, list_length=h)
+                results["-".join(triplet)][str(h)] = result
             self._listed.clear()
         for triplet in self._triplets:
-            make = partial(self._moves, triplet, shares)
-            results["-".join(triplet)]["active"] = self._kept(
-                kept, shares, _piece(triplet), triplet, {"config": asdict(config.nbv())}, make
-            )
+            result = keep(_piece(triplet), triplet, self._moves, config=asdict(config.nbv()))
+            results["-".join(triplet)]["active"] = result
         return results
-
-    def _kept(
-        self,
-        kept: KeptResults,
-        shares: Shares,
-        name: str,
-        triplet: Triplet,
-        made_of: Mapping[str, Any],
-        make: Callable[[], Document],
-    ) -> Document:
-        result = kept.get(name.replace(" ", "-"), make, drives=[self._digests[season] for season in triplet], **made_of)
-        shares.report(name)(1.0)
-        return result
 
     @cached_property
     def _built(self) -> dict[Relevance, Built]:
@@ -182,11 +173,10 @@ class Pair:
             }
         return self._listed[list_length]
 
-    def _single_views(self, list_length: int, triplet: Triplet, shares: Shares) -> Document:
+    def _single_views(self, list_length: int, triplet: Triplet, report: Callable[[float], None]) -> Document:
         """Fig. 6 of a triplet at one list length."""
         config, test = self._config, self._drives[triplet[2]]
         built, whole = self._at(list_length), list_length == self._config.list_length
-        report = shares.report(_piece(triplet, list_length))
         vpr = config.vpr(tuple(built))
         progress = Progress(vpr_stages(vpr), lambda state: report(state.progress))
         truths = [true_images_of(test.route(), self._training.route(), metres) for metres in config.tolerances_m]
@@ -213,9 +203,9 @@ class Pair:
             },
         }
 
-    def _moves(self, triplet: Triplet, shares: Shares) -> Document:
+    def _moves(self, triplet: Triplet, report: Callable[[float], None]) -> Document:
         """Fig. 7 of a triplet, under the paper's set-up and ours."""
-        config, test, report = self._config.nbv(), self._drives[triplet[2]], shares.report(_piece(triplet))
+        config, test = self._config.nbv(), self._drives[triplet[2]]
         starts = starts_of(config, test)
         names = [name for name in planner_names(config) if name != CLAIRVOYANT]
         episodes: dict[str, dict[str, list[Episode]]] = {}
