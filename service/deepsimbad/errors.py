@@ -19,9 +19,11 @@ class DeepSimbadError(Exception):
     """
 
     code: ClassVar[str] = "error"
+    by_code: ClassVar[dict[str, type["DeepSimbadError"]]] = {}  # every class below the root
 
     def __init_subclass__(cls, *, code: str) -> None:
         cls.code = code
+        cls.by_code[code] = cls
 
     def __init__(self, message: str, **hints: Any) -> None:
         super().__init__(message)

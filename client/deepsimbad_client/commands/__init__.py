@@ -7,10 +7,10 @@ output, progress and remarks to standard error.
 import os
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 
 import click
 
+from deepsimbad_campus.__main__ import campus_command
 from deepsimbad_client.commands import admin, recordings
 from deepsimbad_client.commands.console import show_waits
 from deepsimbad_client.errors import DeepSimbadClientError
@@ -18,30 +18,9 @@ from deepsimbad_client.errors import DeepSimbadClientError
 DONE, FAILED, CANCELLED = 0, 1, 130
 RESUMABLE = {"upload", "replay", "download", "campus"}
 GOES_ON = "; the same command goes on where it stopped"
-ELSEWHERE = {"campus": "deepsimbad_campus.__main__:campus_command"}
-"""Commands that are imported when they are asked for."""
 
 
-class LazyGroup(click.Group):
-    """A group that imports some of its commands late."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names of all commands."""
-        return sorted([*super().list_commands(ctx), *ELSEWHERE])
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """One command; None where this installation does not have it."""
-        if cmd_name not in ELSEWHERE:
-            return super().get_command(ctx, cmd_name)
-        module, _, attribute = ELSEWHERE[cmd_name].partition(":")
-        try:
-            command = getattr(import_module(module), attribute)
-        except (ModuleNotFoundError, AttributeError):
-            return None
-        return command if isinstance(command, click.Command) else None
-
-
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="deep-simbad", message="%(version)s")
 def cli() -> None:
     """Send recordings to a Deep SIMBAD service, map them, and see how well it localizes.
@@ -54,7 +33,7 @@ def cli() -> None:
 COMMANDS = (
     *(recordings.upload, recordings.localize, recordings.replay, recordings.watch, admin.remap, admin.jobs),
     *(admin.domains, admin.traverses, admin.sessions, admin.maps, admin.activate, admin.rollback, admin.download),
-    *(admin.delete_domain, admin.delete_traverse, admin.delete_map, admin.delete_session),
+    *(admin.delete_domain, admin.delete_traverse, admin.delete_map, admin.delete_session, campus_command),
 )
 for command in COMMANDS:
     cli.add_command(command)

@@ -148,7 +148,9 @@ def read_bag(
     with _opened(path) as reader:
         types = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
         image_topic = _chosen(image_topic, [name for name, kind in types.items() if kind in _IMAGES], "images", path)
-        placing = sorted((name for name in types if types[name] in _POSITIONS), key=lambda name: _rank(types[name]))
+        placing = sorted(
+            (name for name in types if types[name] in _POSITIONS), key=lambda name: _POSITIONS.index(types[name])
+        )
         if position_topic or placing:
             position_topic = _chosen(position_topic, placing, "positions", path, take_first=True)
             others = f" (there are {', '.join(placing)})" if len(placing) > 1 else ""
@@ -288,10 +290,6 @@ def _chosen(asked: str, there: list[str], what: str, path: Path, *, take_first: 
         raise SourceError(f"{path} holds no {what}: none of its topics has a type that is read")
     trouble = f"no {what} in {asked}" if asked else f"{what} in several topics"
     raise SourceError(f"{path}: {trouble}: name one of {', '.join(sorted(there))} as {BAG_PREFIX}{path}#TOPIC")
-
-
-def _rank(kind: str) -> int:
-    return _POSITIONS.index(kind)
 
 
 def _place(message: Any, kind: str) -> tuple[float, float, float]:

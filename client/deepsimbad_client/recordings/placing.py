@@ -72,7 +72,11 @@ def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) 
     """
     result = Placed(frames, deadband_m=deadband_m)
     stated = any(math.isfinite(frame.position_m) for frame in frames)
-    result.leave_out([_has_place(frame, stated) for frame in frames], "without a position")
+    has_place = [
+        math.isfinite(frame.position_m) if stated else frame.x_m is not None and frame.y_m is not None
+        for frame in frames
+    ]
+    result.leave_out(has_place, "without a position")
     if not result.frames:
         raise SourceError(f"{where}: none of {len(frames)} frames has a position")
     time_us = _in_time_order(result, stated)
@@ -144,10 +148,6 @@ def _span(time_us: Times) -> str:
 
 def _moment(time_us: np.int64) -> str:
     return datetime.fromtimestamp(int(time_us) / 1e6, UTC).isoformat(timespec="milliseconds")
-
-
-def _has_place(frame: Frame, stated: bool) -> bool:
-    return math.isfinite(frame.position_m) if stated else frame.x_m is not None and frame.y_m is not None
 
 
 def _in_time_order(result: Placed, stated: bool) -> Times | None:

@@ -142,10 +142,6 @@ def _asks(action_m: float | None) -> str:
     return f" It asks to see what is {abs(action_m):g} m {'ahead' if action_m > 0 else 'behind'}."
 
 
-def _may_stop(next_best_view: NextBestView | None) -> str:
-    return "-" if next_best_view is None else "yes" if next_best_view.stop else "no"
-
-
 def _lost(probability: float | None) -> str:
     """How probable it is that the robot is off its route or was carried, where that is worth a word."""
     return "" if probability is None or probability < _LEAST_LOST else f", lost with {100 * probability:.0f} %"
@@ -196,7 +192,8 @@ def pictured(
     figures.add_row("likeliest", f"{belief.mode_m:.1f} m", "95 % within", f"{low:.0f} .. {high:.0f} m")
     lost = "-" if belief.off_route is None else f"{100 * belief.off_route:.0f} %"
     figures.add_row("doubt", f"{belief.entropy_bits:.1f} bits", "lost", lost)
-    figures.add_row("confident", "yes" if belief.confident else "no", "may stop", _may_stop(next_best_view))
+    may_stop = "-" if next_best_view is None else "yes" if next_best_view.stop else "no"
+    figures.add_row("confident", "yes" if belief.confident else "no", "may stop", may_stop)
     figures.add_row("views", str(n_observations), "last move", "-" if moved_m is None else f"{moved_m:.1f} m")
     asked = "-" if next_best_view is None else f"{next_best_view.action_m:g} m ({next_best_view.planner})"
     truth = "-" if true_route_m is None else f"{true_route_m:.1f} m"

@@ -402,12 +402,13 @@ def _other_robots(document: dict[str, Any]) -> list[str]:
     reliability, carried, near = (document[part] for part in ("reliability", "carried", "odometry_within_5_m"))
     bins = zip(reliability["near_mode"], reliability["within_5_m"], strict=True)
     standing = {name: f"{share:.1f}" for name, share in document["standing_coverage_95"].items()}
+    lost = "-" if document["lost_their_place"] is None else f"{document['lost_their_place']:.1f}"
     off_route = (f"{share:.1f} {stage}" for stage, share in document["off_route"].items())
     return [
         "within 5 m of the mode, % believed: % true: "
         + ", ".join(f"{held:.0f}: {true:.0f}" for held, true in bins if held is not None),
         f"150 views standing still: {standing['unknown']} % covered from an unknown start, {standing['tracked']} % "
-        f"after 50 m, where {_shown(document['lost_their_place'])} % lost their place",
+        f"after 50 m, where {lost} % lost their place",
         f"carried 100 m or more: found after {carried['views_median']:.0f} views, "
         f"95 of 100 after {carried['views_95']:.0f}",
         f"probability of being lost after ten views, %: {', '.join(off_route)}",
@@ -417,10 +418,6 @@ def _other_robots(document: dict[str, Any]) -> list[str]:
         ),
         f"{sum(document['views_refused'].values())} views refused",
     ]
-
-
-def _shown(share: float | None) -> str:
-    return "-" if share is None else f"{share:.1f}"
 
 
 def _no_second_season(verdict: SameRoute | None) -> tuple[str, ...]:

@@ -344,7 +344,7 @@ class InAnotherProcess:
                         case {"log": record}:
                             _log_here(record, job.job_id)
                         case {"error": {"code": code, "message": text, "hints": hints}}:
-                            raise _error_class(code)(text, **hints)
+                            raise DeepSimbadError.by_code.get(code, DeepSimbadError)(text, **hints)
                         case {"broken": stack}:
                             broken = BrokenJobError("in the job's process:")
                             broken.add_note(stack)
@@ -455,13 +455,3 @@ def _log_here(record: dict[str, Any], job_id: str) -> None:
     logging.getLogger(record["name"]).handle(
         logging.makeLogRecord({**record["extra"], **plain, **text, "job_id": job_id})
     )
-
-
-def _error_class(code: str) -> type[DeepSimbadError]:
-    """The class of the tree that has a code; the root where none has."""
-    waiting: list[type[DeepSimbadError]] = [DeepSimbadError]
-    for candidate in waiting:
-        if candidate.code == code:
-            return candidate
-        waiting.extend(candidate.__subclasses__())
-    return DeepSimbadError
