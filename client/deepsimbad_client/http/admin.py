@@ -26,7 +26,6 @@ from deepsimbad_client.http import (
     Repeat,
     in_path,
     known_positions,
-    model_of,
     named_arrays,
     observation,
     once,
@@ -91,7 +90,7 @@ class AdminCalls(Face):
         document: dict[str, Any] = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
         document |= {} if thumbnails is None else {"thumbnails": thumbnails}
         document |= {} if anchor is None else {"anchor": dict(anchor)}
-        return model_of(Domain, await self._wire.send(Call.with_json("PUT", _domain(name), document)))
+        return await self._wire.model(Domain, Call.with_json("PUT", _domain(name), document))
 
     @shared
     async def delete_domain(self, name: str) -> None:
@@ -107,7 +106,7 @@ class AdminCalls(Face):
         """
         in_path("traverse", name)
         call = Call.with_json("POST", f"{_domain(domain)}/traverses", {"name": name, "grey_levels": grey_levels})
-        return model_of(Traverse, await self._wire.send(call))
+        return await self._wire.model(Traverse, call)
 
     @shared
     async def traverses(self, domain: str) -> tuple[Traverse, ...]:
@@ -117,7 +116,7 @@ class AdminCalls(Face):
     @shared
     async def traverse(self, domain: str, name: str) -> Traverse:
         """One traverse: how many frames have arrived and which are missing."""
-        return model_of(Traverse, await self._wire.send(Call("GET", _traverse(domain, name))))
+        return await self._wire.model(Traverse, Call("GET", _traverse(domain, name)))
 
     @shared
     async def delete_traverse(self, domain: str, name: str) -> None:
@@ -155,7 +154,7 @@ class AdminCalls(Face):
         place |= {"x_m": x_m, "y_m": y_m, "name": None if name is None else text_of(name)}
         place |= {"camera": None if camera is None else text_of(camera), **_keeping(replace)}
         call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
-        return model_of(FrameStored, await self._wire.send(call))
+        return await self._wire.model(FrameStored, call)
 
     @shared
     async def put_frames(
@@ -188,7 +187,7 @@ class AdminCalls(Face):
         np.savez(packed, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
         headers = {"Content-Type": "application/octet-stream"}
         call = Call("POST", f"{_traverse(domain, traverse)}/frames", _keeping(replace), headers, packed.getvalue())
-        return model_of(FramesStored, await self._wire.send(call))
+        return await self._wire.model(FramesStored, call)
 
     @shared
     async def frames(self, domain: str, traverse: str) -> "dict[str, NDArray[Any]]":
@@ -213,7 +212,7 @@ class AdminCalls(Face):
         """
         document = {"training_traverse": training_traverse, **options}
         call = Call.with_json("POST", f"{_domain(domain)}/remaps", document, headers=once(idempotency_key))
-        return model_of(Job, await self._wire.send(call))
+        return await self._wire.model(Job, call)
 
     @shared
     async def feed_experience(
@@ -226,7 +225,7 @@ class AdminCalls(Face):
         """
         document = {"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}
         call = Call.with_json("POST", f"{_domain(domain)}/experience", document, headers=once(idempotency_key))
-        return model_of(Job, await self._wire.send(call))
+        return await self._wire.model(Job, call)
 
     @shared
     async def jobs(self, domain: str | None = None) -> tuple[Job, ...]:
@@ -236,7 +235,7 @@ class AdminCalls(Face):
     @shared
     async def job(self, job_id: str) -> Job:
         """One job."""
-        return model_of(Job, await self._wire.send(Call("GET", _job(job_id))))
+        return await self._wire.model(Job, Call("GET", _job(job_id)))
 
     @shared_stream
     async def job_events(self, job_id: str) -> AsyncGenerator[Job, None]:
@@ -280,7 +279,7 @@ class AdminCalls(Face):
             {"version": int(version), "expected": None if expected is None else int(expected)},
             repeat=Repeat.ALWAYS if expected is None else Repeat.IF_UNTOUCHED,
         )
-        return model_of(MapVersion, await self._wire.send(call))
+        return await self._wire.model(MapVersion, call)
 
     @shared
     async def rollback(self, domain: str) -> MapVersion:

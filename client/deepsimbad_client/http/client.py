@@ -120,12 +120,12 @@ class SessionCalls(Face):
             headers=body.headers | once(idempotency_key),
             body=body.body,
         )
-        return model_of(SessionAnswer, await self._wire.send(call))
+        return await self._wire.model(SessionAnswer, call)
 
     @shared
     async def state(self) -> SessionState:
         """What it believes now, and how many views that rests on."""
-        return model_of(SessionState, await self._wire.send(Call("GET", self._path)))
+        return await self._wire.model(SessionState, Call("GET", self._path))
 
     @shared
     async def belief_masses(self) -> "NDArray[np.float32]":
@@ -167,7 +167,7 @@ class SessionCalls(Face):
         Raises InvalidPriorError (the position is far off the route, or the deviation cannot be one).
         """
         prior = {"position_m": float(position_m), "std_m": float(std_m)}
-        return model_of(SessionState, await self._wire.send(Call.with_json("PUT", f"{self._path}/prior", prior)))
+        return await self._wire.model(SessionState, Call.with_json("PUT", f"{self._path}/prior", prior))
 
     @shared
     async def truths(
@@ -235,12 +235,12 @@ class ClientCalls(Face, Generic[AnySession]):
     @shared
     async def health(self) -> Health:
         """Whether the process is alive."""
-        return model_of(Health, await self._wire.send(Call("GET", "/healthz")))
+        return await self._wire.model(Health, Call("GET", "/healthz"))
 
     @shared
     async def ready(self) -> Health:
         """Whether it can answer now; asked once. Raises UnavailableError: not yet; its detail says why."""
-        return model_of(Health, await self._wire.send(Call("GET", "/readyz", repeat=Repeat.NEVER)))
+        return await self._wire.model(Health, Call("GET", "/readyz", repeat=Repeat.NEVER))
 
     @shared
     async def metrics(self) -> str:
@@ -255,7 +255,7 @@ class ClientCalls(Face, Generic[AnySession]):
     @shared
     async def domain(self, name: str) -> Domain:
         """One domain and its active map. Raises UnknownDomainError (there is none of that name)."""
-        return model_of(Domain, await self._wire.send(Call("GET", domain_path(name))))
+        return await self._wire.model(Domain, Call("GET", domain_path(name)))
 
     @shared
     async def on_board(self, domain: str, *, map_version: int | None = None) -> "OnBoardEncoder":
@@ -273,13 +273,13 @@ class ClientCalls(Face, Generic[AnySession]):
     async def coverage(self, domain: str, *, map_version: int | None = None) -> Coverage:
         """Where on its route a map can be trusted. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
         call = Call("GET", f"{domain_path(domain)}/coverage", {"map_version": map_version})
-        return model_of(Coverage, await self._wire.send(call))
+        return await self._wire.model(Coverage, call)
 
     @shared
     async def landmarks(self, domain: str, *, map_version: int | None = None) -> Landmarks:
         """What a map's landmarks began as. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
         call = Call("GET", f"{domain_path(domain)}/landmarks", {"map_version": map_version})
-        return model_of(Landmarks, await self._wire.send(call))
+        return await self._wire.model(Landmarks, call)
 
     @shared
     async def landmark_thumbnail(self, domain: str, landmark: int, *, map_version: int | None = None) -> bytes:
@@ -313,7 +313,7 @@ class ClientCalls(Face, Generic[AnySession]):
         body = observation(image, **view)
         path = f"{domain_path(domain)}/localizations"
         call = Call("POST", path, {"shortlist": shortlist}, body.headers, body.body)
-        return model_of(Localization, await self._wire.send(call))
+        return await self._wire.model(Localization, call)
 
     @shared
     async def localize_anywhere(
@@ -333,9 +333,7 @@ class ClientCalls(Face, Generic[AnySession]):
         """
         body = observation(image, **view)
         params = {"domains": domains, "shortlist": shortlist, "in_full": in_full}
-        return model_of(
-            Whereabouts, await self._wire.send(Call("POST", "/v1/localizations", params, body.headers, body.body))
-        )
+        return await self._wire.model(Whereabouts, Call("POST", "/v1/localizations", params, body.headers, body.body))
 
     @shared
     async def relevances(
@@ -389,7 +387,7 @@ class ClientCalls(Face, Generic[AnySession]):
             "price_bits_per_m": price_bits_per_m,
         }
         call = Call.with_json("POST", f"{domain_path(domain)}/sessions", document, headers=once(idempotency_key))
-        return self._session(self._wire, model_of(SessionState, await self._wire.send(call)), keep=keep)
+        return self._session(self._wire, await self._wire.model(SessionState, call), keep=keep)
 
     @shared
     async def attach_session(self, session_id: str, *, keep: bool = True) -> AnySession:
@@ -479,4 +477,4 @@ class AsyncClient(ClientCalls[AsyncSession], Awaiting):
 
 async def _truths(wire: Wire, path: str, true_positions_m: Numbers, **more: Any) -> TruthScore:
     document = {"true_positions_m": known_positions(true_positions_m), **more}
-    return model_of(TruthScore, await wire.send(Call.with_json("POST", f"{path}/truths", document)))
+    return await wire.model(TruthScore, Call.with_json("POST", f"{path}/truths", document))

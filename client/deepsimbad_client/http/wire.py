@@ -28,6 +28,7 @@ from deepsimbad_client.http import (
     Call,
     Model,
     Repeat,
+    model_of,
     page_of,
     problem_of,
     raise_for_problem,
@@ -271,6 +272,10 @@ class Wire:
                     raise_for_problem(response)
                 return response
             await self.link.sleep(wait_s)
+
+    async def model(self, kind: type[Model], call: Call) -> Model:
+        """What a call is answered; raises as `send`."""
+        return model_of(kind, await self.send(call))
 
     async def model_list(self, kind: type[Model], key: str, path: str, **params: str | None) -> tuple[Model, ...]:
         """Every entry of a list, page after page."""
