@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image as Pictures
-from PIL import UnidentifiedImageError
 
 from deepsimbad.core.camera import UPRIGHT_TURN
 from deepsimbad_client.errors import SourceError
@@ -230,7 +229,7 @@ def shape_in(file: Path | BytesIO) -> str | None:
     try:
         with Pictures.open(file) as picture:
             (width, height), exif = picture.size, picture.getexif()
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Pictures.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError, Pictures.DecompressionBombError):
         return None
     if exif.get(_ORIENTATION) in _LYING:
         width, height = height, width

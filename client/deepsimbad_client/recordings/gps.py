@@ -17,7 +17,6 @@ from xml.etree.ElementTree import ParseError, iterparse
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pictures
-from PIL import UnidentifiedImageError
 
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings.track import Reals, Track, track_of
@@ -114,7 +113,7 @@ def read_exif(path: Path) -> Taken:
         with Pictures.open(path) as picture:
             exif = picture.getexif()
             gps, details = exif.get_ifd(_GPS), exif.get_ifd(_EXIF)
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Pictures.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError, Pictures.DecompressionBombError):
         return Taken()
     latitude, longitude = _exif_degrees(gps, *_LATITUDE), _exif_degrees(gps, *_LONGITUDE)
     with suppress(KeyError, ValueError, TypeError, ZeroDivisionError):

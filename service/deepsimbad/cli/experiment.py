@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import click
 import numpy as np
@@ -13,9 +13,11 @@ from rich.table import Table
 
 from deepsimbad.cli.terminal import (
     RELEVANCES,
+    Command,
     config_option,
     evaluator_option,
     evaluators_option,
+    folder_option,
     given_settings,
     print_table,
     progress_bar,
@@ -48,7 +50,6 @@ _ROLES = ("landmarks", "training", "test")
 _READING_STAGES = {f"read {role}": 2.0 for role in _ROLES}
 STANDARD_OUTPUT = Path("-")
 DEFAULT_TOLERANCE_M = 2.0
-_Command = TypeVar("_Command", bound=Callable[..., Any])
 json_file_option = click.option(
     "--json",
     "json_file",
@@ -64,7 +65,7 @@ tolerance_option = click.option(
 )
 
 
-def _triplet_options(command: _Command) -> _Command:
+def _triplet_options(command: Command) -> Command:
     """The options that every experiment has; their values are `asked` of what follows."""
     options = (
         click.option("--landmarks", required=True, help="SOURCE landmarks are selected from."),
@@ -85,12 +86,8 @@ def _triplet_options(command: _Command) -> _Command:
         ),
         json_file_option,
         config_option,
-        click.option(  # as every command does, so that a script may give it to all of them
-            "--data-dir",
-            type=click.Path(file_okay=False, path_type=Path),
-            expose_value=False,
-            help="Taken as by every command; an experiment reads and keeps nothing there.",
-        ),
+        # As every command does, so that a script may give it to all of them
+        folder_option("--data-dir", "Taken as by every command; an experiment reads and keeps nothing there.", None),
     )
     return reduce(lambda decorated, option: option(decorated), reversed(options), command)
 

@@ -1,15 +1,15 @@
 """`deepsimbad serve`, and what a service needs beside it or before it: data directory, settings, keys."""
 
 import logging
-from collections.abc import Callable
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 from rich.markup import escape
 from rich.table import Table
 
 from deepsimbad.cli.terminal import (
+    Command,
     data_dir_option,
     given_settings,
     json_list_option,
@@ -29,10 +29,8 @@ from deepsimbad.store.records import KeyRecord, KeyScope, now
 
 log = logging.getLogger(__name__)
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
 
-
-def address_options(command: _Command) -> _Command:
+def address_options(command: Command) -> Command:
     """Where a command that serves listens."""
     host = click.option("--host", help="Address to listen on.  [default: $DEEPSIMBAD_HOST, else 127.0.0.1]")
     port = click.option(

@@ -34,7 +34,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 RELEVANCES = click.Choice([relevance.value for relevance in Relevance])
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
@@ -62,15 +62,18 @@ config_option = click.option(
 )
 
 
-def data_dir_option(command: _Command) -> _Command:
+def folder_option(
+    flag: str, about: str, callback: Callable[..., object] | None = remember
+) -> Callable[[Command], Command]:
+    """An option of a folder that settings name too."""
+    folder = click.Path(file_okay=False, path_type=Path)
+    return click.option(flag, type=folder, expose_value=False, callback=callback, help=about)
+
+
+def data_dir_option(command: Command) -> Command:
     """`--data-dir`, else as settings say, else ./deepsimbad-data; with `--config`."""
-    return click.option(
-        "--data-dir",
-        type=click.Path(file_okay=False, path_type=Path),
-        expose_value=False,
-        callback=remember,
-        help="Folder of domains and maps.  [default: $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data]",
-    )(config_option(command))
+    about = "Folder of domains and maps.  [default: $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data]"
+    return folder_option("--data-dir", about)(config_option(command))
 
 
 def traced_settings(**flags: object) -> TracedSettings:

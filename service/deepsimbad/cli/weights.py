@@ -3,12 +3,11 @@
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 from rich.console import Console
@@ -17,12 +16,13 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColum
 from rich.table import Column, Table
 
 from deepsimbad.cli.terminal import (
+    Command,
     data_dir_option,
+    folder_option,
     given_settings,
     json_list_option,
     json_option,
     print_table,
-    remember,
     write_json,
 )
 from deepsimbad.errors import InvalidInputError, MissingWeightsError
@@ -31,21 +31,15 @@ from deepsimbad.evaluators.weights.downloads import HubWish, Tell, pull_file, pu
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, canonical, known
 from deepsimbad.evaluators.weights.lock import HUB_FOLDER, Lock
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
 _SHA256 = re.compile(r"[0-9a-fA-F]{8,64}")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _SIZE = re.compile(r"([1-9]\d{0,3})x([1-9]\d{0,3})")
 
 
-def _folder_options(command: _Command) -> _Command:
+def _folder_options(command: Command) -> Command:
     """`--weights-dir`, beside what every command takes."""
-    return click.option(
-        "--weights-dir",
-        type=click.Path(file_okay=False, path_type=Path),
-        expose_value=False,
-        callback=remember,
-        help="Folder of weights.  [default: $DEEPSIMBAD_WEIGHTS_DIR, else ~/.cache/deepsimbad/weights]",
-    )(data_dir_option(command))
+    about = "Folder of weights.  [default: $DEEPSIMBAD_WEIGHTS_DIR, else ~/.cache/deepsimbad/weights]"
+    return folder_option("--weights-dir", about)(data_dir_option(command))
 
 
 @click.group()

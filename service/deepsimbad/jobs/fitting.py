@@ -5,6 +5,7 @@ route too where views agree that it is one, and, where it wants images, from aug
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -197,13 +198,7 @@ def _same_places(plan: MapPlan, candidates: Drive, other: Drive, rows: NDArray[n
 
     def by_l2(drive: Drive) -> Drive:
         encodings = np.ascontiguousarray(drive.encodings)
-        return Drive(
-            position_m=drive.position_m,
-            x_m=drive.x_m,
-            y_m=drive.y_m,
-            encodings=encodings,
-            dissimilarities=squared_distances(encodings, landmarks),
-        )
+        return replace(drive, encodings=encodings, dissimilarities=squared_distances(encodings, landmarks))
 
     season, _, _ = second_season(by_l2(candidates), plan.closed, other, plan.same_route, by_l2)
     return None if season is None else season.places

@@ -1,7 +1,8 @@
 """Two drives tried out: one is mapped, the other localized on it in order as one session, and held to the truth."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -79,10 +80,11 @@ class TrialReport:
     seconds: dict[str, float]  # by stage
     n_forgot: int = 0  # moves that the belief had no room for, after which the session began anew
     warnings: tuple[str, ...] = ()  # of fitting the evaluator
-    stretches: list[Stretch] = field(init=False)  # those where some query fails, worst first
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "stretches", _stretches(self.queries, self.outcomes))
+    @cached_property
+    def stretches(self) -> list[Stretch]:
+        """Those where some query fails, worst first."""
+        return _stretches(self.queries, self.outcomes)
 
     def share_within(self, metres: float) -> float:
         """Percent of scored queries after which the session's likeliest place was no farther off; NaN without any."""
