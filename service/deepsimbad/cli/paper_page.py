@@ -3,13 +3,13 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deepsimbad.cli.terminal import write_html, write_json
+from deepsimbad.cli.terminal import render, write_json
 from deepsimbad.core.planners import DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.jobs.experiments.paper import Document
@@ -37,11 +37,17 @@ def write_report(out: Path, document: Document) -> list[Path]:
     means += [each["mean"] for some in by_length.values() for each in some if each]
     means += [value for each in document["by_triplet"].values() for value in _anr(document, each).values()]
     scale = Scale([value for value in means if value > 0] or [1.0])
-    page = write_html(
+    told = {
+        **document,
+        "methods_shown": METHODS,
+        "shown_name": shown_name,
+        "rows": list(_method_rows(document)),
+        "encode_ms": _encode_ms(document),
+    }
+    page = render(
         out / "index.html",
         "paper_page.html",
-        **document,
-        methods_shown=METHODS,
+        **told,
         bound=_BOUND,
         default=DEFAULT_RELEVANCE.value,
         curves={name: _curve(some, len(lengths), scale) for name, some in by_length.items()},
@@ -52,18 +58,15 @@ def write_report(out: Path, document: Document) -> list[Path]:
             for triplet, each in document["by_triplet"].items()
         },
         panels=_panels(document),
-        shown_name=shown_name,
         trajectories=_trajectories(document["seasons"]),
-        rows=list(_method_rows(document)),
-        encode_ms=_encode_ms(document),
         ranks=RANKS,
         n_hold={
             who: sum(each["verdict"] == HOLDS for each in document["claims"] if each["said_by"] == who)
             for who in ("paper", "us")
         },
     )
-    text, table, whole = out / "report.md", out / "figures.csv", out / "paper.json"
-    text.write_text("\n".join(markdown(document)) + "\n", encoding="utf-8")
+    text = render(out / "report.md", "paper_report.md", **told)
+    table, whole = out / "figures.csv", out / "paper.json"
     table.write_text(_csv(document), encoding="utf-8")
     write_json(document, whole)
     return [page, text, table, whole]
@@ -198,112 +201,3 @@ def _csv(document: Document) -> str:
         for name, value in each["views_to_confident"].items():
             writer.writerow([triplet, "views_to_confident", name, h, "", value])
     return text.getvalue()
-
-
-def _interval(figure: Document, group: str) -> str:
-    low, high = figure[group]
-    return f"{low:.2f} .. {high:.2f}"
-
-
-def _table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
-    titles = list(titles)
-    yield from ("", f"| {' | '.join(titles)} |", "|---" * len(titles) + "|")
-    yield from (f"| {' | '.join(row)} |" for row in rows)
-
-
-def markdown(document: Document) -> Iterator[str]:
-    """The report's tables."""
-    h, lengths, active = document["list_length"], document["anr"], document["active"]
-    drives = ", ".join(
-        f"{season} {each['date']} ({each['n_frames']} frames, {each['length_m']:.0f} m)"
-        for season, each in document["seasons"].items()
-    )
-    yield f"Machine: {document['machine']}; deep-simbad {document['release']}."
-    yield ""
-    yield (
-        f"Drives: {drives}. {len(document['by_triplet'])} triplets, {document['n_queries']} test frames, "
-        f"{document['n_left_out']} more without a true map image; {document['n_episodes']} episodes of every planner. "
-        "Intervals are 95 %, by bootstrap over stretches of 20 m, and over test drives."
-    )
-    yield from (f"\nMissing: {season}, {why}." for season, why in document["missing"].items())
-    yield from ("", "## What holds")
-    yield from _table(
-        ("claim", "by", "verdict", "figures", "triplets", "difference, stretches"),
-        (
-            (
-                *(each["claim"], each["said_by"], each["verdict"]),
-                ", ".join(
-                    f"{METHODS.get(name, shown_name(name))} {value:.2f}" for name, value in each["values"].items()
-                ),
-                f"{each['n_agree']} of {each['n_triplets']}",
-                _interval(each["difference"], "stretches"),
-            )
-            for each in document["claims"]
-        ),
-    )
-    yield from (f"\n{each['claim']}: {each['verdict']}. {each['why']}" for each in document["claims"] if each["why"])
-    yield from ("", "## Fig. 6: ANR % of single views, by list length")
-    yield from _table(
-        ("h", *lengths),
-        ((label, *(_mean(anr.get(name)) for anr in lengths.values())) for name, label in METHODS.items()),
-    )
-    yield from ("", f"By triplet at h = {h}:")
-    rows = list(_method_rows(document))
-    yield from _table(
-        ("", "mean", "stretches", "drives", *document["by_triplet"]),
-        (
-            (
-                *(row["label"], _mean(row["anr"]), _interval(row["anr"], "stretches"), _interval(row["anr"], "drives")),
-                *(f"{_anr(document, each)[row['name']]:.2f}" for each in document["by_triplet"].values()),
-            )
-            for row in rows
-        ),
-    )
-    yield from ("", f"## Recall and size at h = {h}")
-    yield from _table(
-        ("", "bits a map image", *(f"R@1 / R@5 / R@10 within {metres} m" for metres in document["recall"])),
-        (
-            (
-                *(row["label"], f"{row['bits']:.1f}"),
-                *(" / ".join(f"{value:.1f}" for value in at.values()) for at in row["recall"].values()),
-            )
-            for row in rows
-        ),
-    )
-    yield from ("", "## Fig. 7: moves")
-    titles = (
-        "planner",
-        "ANR %, paper's set-up",
-        "stretches",
-        "ANR %, ours",
-        "stretches",
-        "views until sure",
-        "wrong %",
-    )
-    yield from _table(
-        (*titles, "mean move, m"),
-        (
-            (
-                *(shown_name(name), _mean(active["paper"][name]), _interval(active["paper"][name], "stretches")),
-                *(_mean(ours), _interval(ours, "stretches"), _mean(active["views"][name])),
-                f"{document['wrong_when_confident'][name]:.1f}",
-                f"{document['mean_move_m']['ours'][name]:.1f}",
-            )
-            for name, ours in active["ours"].items()
-        ),
-    )
-    yield from ("", "## Milliseconds a view")
-    yield from _table(
-        ("set-up", *document["took_ms"]["paper"]),
-        ((setup, *(f"{ms:.3f}" for ms in stages.values())) for setup, stages in document["took_ms"].items()),
-    )
-    if (encode_ms := _encode_ms(document)) is not None:
-        yield f"\nFrom reading an image to its encoding: {encode_ms:.0f} ms."
-    yield (
-        f"\nDissimilarity evaluations of a training run: {document['evaluations']:,}, about "
-        f"{document['evaluations_s']:.1f} s (every frame once; the paper's {document['evaluations_of_the_paper']:,})."
-    )
-
-
-def _mean(figure: Document | None) -> str:
-    return "" if figure is None else f"{figure['mean']:.2f}"

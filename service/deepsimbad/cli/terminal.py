@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
@@ -239,12 +239,15 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_html(file: Path, template: str, **values: Any) -> Path:
-    """Render a template beside this file: one file with everything in it, no script, both colour themes."""
-    page = Environment(
-        loader=PackageLoader("deepsimbad.cli", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+def render(file: Path, template: str, **values: Any) -> Path:
+    """Write a template beside this file; a page has everything in it, no script, both colour themes."""
+    templates = Environment(
+        loader=PackageLoader("deepsimbad.cli", "."),
+        autoescape=select_autoescape(),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
     )
-    text = page.get_template(template).render(**values)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text, encoding="utf-8")
+    file.write_text(templates.get_template(template).render(**values), encoding="utf-8")
     return file

@@ -23,7 +23,7 @@ from deepsimbad.cli.terminal import (
     given_settings,
     print_table,
     progress_bar,
-    write_html,
+    render,
 )
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
@@ -229,7 +229,7 @@ def write_page(
 ) -> Path:
     """Write the page; `document` is the trial's JSON, and the albums hold the frames of both drives."""
     cards = _cards(report, places, queries, on_progress)
-    return write_html(
+    return render(
         file,
         "trial_page.html",
         **document,
