@@ -3,13 +3,14 @@
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from deepsimbad.core.route import Route, true_images_of
 from deepsimbad_client.errors import (
@@ -210,7 +211,7 @@ class Journal(Generic[Record]):
     """`replay.json` says what is replayed; a file of JSON lines holds the records, appended as they come.
 
     An earlier replay of the same `identity` goes on, unless `restart` throws it away: `document` is its identity and
-    what was noted beside it, `earlier` its records in order, as `read` makes them of a line's document. Raises
+    what was noted beside it, `earlier` its records in order, each of the `kind`. Raises
     ReplayError (the folder holds another replay, or cannot be written).
     """
 
@@ -219,7 +220,7 @@ class Journal(Generic[Record]):
         folder: Path,
         file_name: str,
         identity: Mapping[str, Any],
-        read: Callable[[dict[str, Any]], Record],
+        kind: TypeAdapter[Record],
         what: str,
         *,
         restart: bool = False,
@@ -232,7 +233,7 @@ class Journal(Generic[Record]):
             folder.mkdir(parents=True, exist_ok=True)
             if not restart and (folder / _IDENTITY_FILE).exists():
                 self.document = self._same_replay(identity)
-                self.earlier = self._records(read, what)
+                self.earlier = self._records(kind, what)
             else:
                 self._file.unlink(missing_ok=True)
                 self.note()
@@ -272,7 +273,7 @@ class Journal(Generic[Record]):
             )
         return earlier
 
-    def _records(self, read: Callable[[dict[str, Any]], Record], what: str) -> list[Record]:
+    def _records(self, kind: TypeAdapter[Record], what: str) -> list[Record]:
         """Read the whole lines; a torn last one, left by a crash, is cut off."""
         if not self._file.exists():
             return []
@@ -283,8 +284,8 @@ class Journal(Generic[Record]):
         records = []
         for number, line in enumerate(whole.splitlines(), start=1):
             try:
-                records.append(read(json.loads(line)))
-            except (ValueError, TypeError, AttributeError, KeyError) as error:
+                records.append(kind.validate_json(line))
+            except ValueError as error:
                 raise ReplayError(
                     f"line {number} of {self._file} is no {what}: restart the replay or repair it"
                 ) from error

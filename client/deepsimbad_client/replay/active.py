@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad_client.errors import ReplayError
@@ -117,7 +118,7 @@ def active_replay(
     planners = tuple(dict.fromkeys(planners))
     identity = {"kind": "active", **stage.scene.identity, "steps": steps, "seed": seed}
     identity |= {"truth_within_m": TRUTH_WITHIN_M}
-    with Journal(folder, "episodes.jsonl", identity, _episode, "episode", restart=restart) as journal:
+    with Journal(folder, "episodes.jsonl", identity, TypeAdapter(Episode), "episode", restart=restart) as journal:
         wanted = [(planner, episode) for episode in range(episodes) for planner in planners]
         done = {(episode.planner, episode.episode): episode for episode in journal.earlier}
         earlier = [key for key in wanted if key in done]
@@ -266,9 +267,3 @@ class Stage:
             latency_ms=seen.latency_ms,
             mass=tuple(round(share, MASS_DIGITS) for share in belief.histogram.mass),
         )
-
-
-def _episode(document: dict[str, Any]) -> Episode:
-    steps = tuple(EpisodeStep(**step | {"mass": tuple(step["mass"])}) for step in document["steps"])
-    low_m, high_m = document["edges_m"]
-    return Episode(**document | {"edges_m": (low_m, high_m), "steps": steps})

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from deepsimbad.core.route import Route
 from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
@@ -48,6 +49,7 @@ class Step:
 
 
 _Record = Step | list[float | None]  # a view, or the ranks of views before it in order
+_RECORDS: TypeAdapter[_Record] = TypeAdapter(_Record)
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def replay(
     started = time.perf_counter()
     scene = Scene.of(client, recording, domain, tolerance_m, viewers)
     identity = {"kind": "passive", **scene.identity, "tolerance_m": tolerance_m}
-    with Journal(folder, "views.jsonl", identity, _record, "view", restart=restart) as journal:
+    with Journal(folder, "views.jsonl", identity, _RECORDS, "view", restart=restart) as journal:
         drive = _Drive(scene, journal, on_progress)
         for step in drive.steps:
             if step.broken is not None:
@@ -207,9 +209,3 @@ class _Drive:
         """End the session, if this run had one."""
         if "_session" in vars(self):
             self._session.delete()
-
-
-def _record(document: Any) -> _Record:
-    if isinstance(document, list):
-        return [None if rank is None else float(rank) for rank in document]
-    return Step(**document | {"mass": tuple(document["mass"])})

@@ -98,8 +98,7 @@ def given_settings(**flags: object) -> Settings:
 def existing_data_dir() -> Path:
     """The data directory, where it holds a catalog: a question must not make the folder it asks about.
 
-    Raises:
-        UnknownDomainError: It holds none.
+    Raises UnknownDomainError: it holds none.
     """
     data_dir = given_settings().data_dir
     if not catalog_path(data_dir).is_file():

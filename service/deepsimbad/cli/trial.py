@@ -35,7 +35,6 @@ from deepsimbad.jobs.experiments.kept import kept_encodings
 from deepsimbad.jobs.experiments.trial import (
     RECALL_RANKS,
     TRIAL_STAGES,
-    Outcome,
     Stretch,
     TrialConfig,
     TrialReport,
@@ -257,21 +256,12 @@ def _cards(
         n_bytes = places.n_bytes + queries.n_bytes
         if n_bytes > MOST_BYTES:
             break
-        cards.append(_card(row, outcome, report, places, queries))
+        truth = outcome.true_image if outcome.is_wrong else None
+        card = {"row": row, "position_m": float(report.queries.position_m[row]), "outcome": outcome}
+        card |= {"query": queries.shown(row), "best": places.shown(outcome.best_image)}
+        cards.append({**card, "truth": None if truth is None else places.shown(truth)})
         on_progress(max(len(cards) / len(scored), n_bytes / MOST_BYTES))
     return cards
-
-
-def _card(row: int, outcome: Outcome, report: TrialReport, places: Album, queries: Album) -> dict[str, Any]:
-    is_wrong, truth = outcome.is_wrong, outcome.true_image
-    return {
-        "row": row,
-        "position_m": float(report.queries.position_m[row]),
-        "outcome": outcome,
-        "query": queries.shown(row),
-        "best": places.shown(outcome.best_image),
-        "truth": places.shown(truth) if is_wrong and truth is not None else None,
-    }
 
 
 def _linked(stretches: Sequence[Stretch], cards: Sequence[dict[str, Any]]) -> list[tuple[Stretch, int | None]]:

@@ -1,8 +1,11 @@
 """One service of the fleet: the whole application in a process of Ray Serve's, asked by ASGI in place of a socket."""
 
 import asyncio
+import fcntl
+import os
 import shutil
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+import tempfile
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, aclosing, suppress
 from dataclasses import replace
@@ -10,9 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
+import anyio
 from ray import serve
 from ray.serve.handle import DeploymentHandle
-from starlette.types import Message, Scope
+from starlette.types import ASGIApp, Message, Scope
 
 from deepsimbad.api.app import Elsewhere, create_app, follow
 from deepsimbad.api.localizations import render_localization
@@ -25,25 +29,24 @@ from deepsimbad.engine.localizer import Localization, View
 from deepsimbad.engine.maps import MappedDomain
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError, NotLoadedError, UnknownDomainError, UnknownJobError
-from deepsimbad.fleet.all_jobs import AllJobs
-from deepsimbad.fleet.all_sessions import AllSessions
-from deepsimbad.fleet.asgi import asked
-from deepsimbad.fleet.backend import Backend
+from deepsimbad.fleet.backend import BRIEFLY_S, Backend
 from deepsimbad.fleet.encoder import AskedEncoder, Encoder
-from deepsimbad.fleet.folders import new_folder
+from deepsimbad.fleet.lists import AllJobs, AllSessions
 from deepsimbad.fleet.owners import AskedOwners
 from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
 from deepsimbad.settings import Settings
+from deepsimbad.store.durable import lock_folder
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.records import JobRecord, KeyRecord
 from deepsimbad.store.sessions import ListedSession
 from deepsimbad.store.shared_catalog import SharedCatalog
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
-_TIMEOUT_S = 5.0  # of what one asks of another
 _START_S = 60.0  # that a replica waits for the one that administers, whose keys it reads
 _THREADS = 64
+_MESSAGES = 8  # of an answer that may wait to be fetched
+_FOLDER_PREFIX = "deepsimbad-replica-"  # before the process's number
 
 MakeRunJob: TypeAlias = Callable[[Path], RunJob]
 
@@ -67,7 +70,7 @@ def keys_of(admin: "DeploymentHandle[Replica]") -> Callable[[], Sequence[KeyReco
     """What reads the keys of the one that has them, in a thread of its own."""
 
     def read() -> Sequence[KeyRecord]:
-        records: Sequence[KeyRecord] = admin.keys.remote().result(timeout_s=_TIMEOUT_S)
+        records: Sequence[KeyRecord] = admin.keys.remote().result(timeout_s=BRIEFLY_S)
         return records
 
     return read
@@ -116,7 +119,7 @@ class Replica:
                 newest_jobs=jobs.newest,
             )
         else:
-            folder = new_folder()
+            folder = _new_folder()
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
             settings = settings.model_copy(update={"data_dir": folder})
             name = serve.get_replica_context().deployment
@@ -131,7 +134,7 @@ class Replica:
         if encoder is not None:
             backend = Backend(encoder)
             self._watching.append(asyncio.create_task(backend.watch()))
-            await backend.there(_TIMEOUT_S)
+            await backend.there(BRIEFLY_S)
             asking = AskedEncoder(backend, asyncio.get_running_loop())
             elsewhere = replace(elsewhere, make_evaluator=by_encoder(asking))
         self._app = create_app(settings, make_run_job and make_run_job(settings.data_dir), elsewhere)
@@ -147,7 +150,7 @@ class Replica:
                 asked = (each.reread_keys.remote() for each in hear)
                 told = asyncio.gather(*asked, return_exceptions=True)
                 with suppress(TimeoutError):  # who is away reads them at its start
-                    await asyncio.wait_for(told, _TIMEOUT_S)
+                    await asyncio.wait_for(told, BRIEFLY_S)
 
             if admin is None:
                 self._services.keys.announce = announce
@@ -248,6 +251,46 @@ class Replica:
 
     async def stream(self, scope: Scope, body: bytes) -> AsyncIterator[Message]:
         """An answer as the application sends it."""
-        async with aclosing(asked(self._app, scope, body)) as messages:
+        async with aclosing(_asked(self._app, scope, body)) as messages:
             async for message in messages:
                 yield message
+
+
+async def _asked(app: ASGIApp, scope: Scope, body: bytes) -> AsyncGenerator[Message]:
+    """The messages of an application's answer to a request with this body, as ASGI sends them without a socket."""
+    parts = [{"type": "http.request", "body": body, "more_body": False}]
+    send, messages = anyio.create_memory_object_stream[Message](_MESSAGES)
+
+    async def receive() -> Message:
+        if not parts:
+            await asyncio.Event().wait()  # nobody leaves; who does is heard of by cancelling
+        return parts.pop()
+
+    async def answer() -> None:
+        async with send:
+            await app(scope, receive, send.send)
+
+    answering = asyncio.create_task(answer())
+    try:
+        async for message in messages:
+            yield message
+    finally:
+        messages.close()
+        answering.cancel()
+
+
+def _new_folder() -> Path:
+    """An empty folder of this process's, once those of processes that were killed were removed."""
+    _clear_away()
+    return Path(tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-"))
+
+
+def _clear_away() -> None:
+    for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
+        with suppress(OSError):  # another user's
+            process = Path("/proc", folder.name.removeprefix(_FOLDER_PREFIX).partition("-")[0], "exe")
+            if process.exists():  # of one that ended and is not yet reaped it does not
+                continue
+            if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(descriptor)

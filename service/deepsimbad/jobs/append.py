@@ -43,8 +43,7 @@ LANDMARK_TRAVERSE, ACTIVE_MAP, TRAINING = "landmark_traverse", "active_map", "tr
 def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:
     """Refuse to append a traverse that a map holds by name, though it may hold other frames by now.
 
-    Raises:
-        InvalidMapConfigError: The map is made of a traverse of that name.
+    Raises InvalidMapConfigError: the map is made of a traverse of that name.
     """
     if name in traverses_in(config):
         raise InvalidMapConfigError(

@@ -50,8 +50,7 @@ class CheckFrames:
     def of(cls, source: str, drive: Drive, closed: bool, *, held_out: bool) -> Self:
         """Evenly spaced frames of a drive of its own, or every tenth of the training traverse; of long ones fewer.
 
-        Raises:
-            InvalidRouteError: The drive goes backwards.
+        Raises InvalidRouteError: the drive goes backwards.
         """
         step = max(HELD_OUT_EVERY if held_out else 1, -(-drive.n_frames // MOST_QUERIES))
         asked = np.arange(0, drive.n_frames, step)
@@ -90,10 +89,8 @@ def check_map(
     A gate is lost where the new ANR is more than `gate_margin` percentage points above the active one, and where the
     two cannot be compared on these frames though a sound map serves: who asks for a gate wants no map to take over
     unseen. Where no map serves, or a damaged one, there is nothing to lose and the gate passes. `why` says which.
-    `warnings` names a map that took its landmarks from the check's own drive.
-
-    Raises:
-        UnavailableError: The active map may be whole, but could not be read.
+    `warnings` names a map that took its landmarks from the check's own drive. Raises UnavailableError: the active map
+    may be whole, but could not be read.
     """
     serving = catalog.domain(domain).active_version
     its_name = f"map {serving}, which serves,"

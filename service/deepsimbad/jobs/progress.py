@@ -65,11 +65,7 @@ class Progress:
         self.update(0.0)
 
     def update(self, share: float) -> None:
-        """Report the share of the present stage that is done, 0..1.
-
-        Raises:
-            CancelledError: The work was cancelled.
-        """
+        """Report the share of the present stage that is done, 0..1. Raises CancelledError: the work was cancelled."""
         self.check()
         now_s = self._clock()
         if self._on_change is None or now_s - self._reported_s < _INTERVAL_S:

@@ -143,8 +143,7 @@ def stages_in(data_dir: Path, domain: str, config: RemapConfig, fitting: Fitting
 def refuse_impossible(config: RemapConfig, n_frames: Mapping[str, int], active: Map | None) -> None:
     """Say before the job what it would end with, as far as its traverses' numbers of frames and the active map tell.
 
-    Raises:
-        InvalidMapConfigError: A traverse is empty, there are too few landmarks, or the active map's do not fit.
+    Raises InvalidMapConfigError: a traverse is empty, there are too few landmarks, or the active map's do not fit.
     """
     for name, n in n_frames.items():
         check_filled(name, n)
@@ -183,8 +182,7 @@ def staying(config: RemapConfig, active: Map) -> Map | None:
 def check_alike(before: Map, config: RemapConfig) -> None:
     """What describes the images of one map is the same for all of them; what is left at its default is the map's.
 
-    Raises:
-        InvalidMapConfigError: Something else is asked for than the map has.
+    Raises InvalidMapConfigError: something else is asked for than the map has.
     """
     asked = {
         "n_landmarks": (config.n_landmarks, None, before.n_landmarks),

@@ -138,8 +138,7 @@ class JobRunner:
     def made_before(self, job_id: str | None, config: RemapConfig | ExperienceConfig) -> JobRecord | None:
         """The job of that id, which an earlier request made; None: there is none.
 
-        Raises:
-            IdempotencyKeyReusedError: It was asked for something else.
+        Raises IdempotencyKeyReusedError: it was asked for something else.
         """
         if job_id is None:
             return None
@@ -154,8 +153,7 @@ class JobRunner:
     def cancel(self, job_id: str) -> JobRecord:
         """Ask a job to stop; a queued one ends at once, a running one at its next report.
 
-        Raises:
-            UnknownJobError: No such job.
+        Raises UnknownJobError: no such job.
         """
         job = self._catalog.cancel_queued_job(job_id)
         event = self._cancelled.get(job_id)

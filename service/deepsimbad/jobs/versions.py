@@ -77,8 +77,7 @@ def seal_version(
 def activate_once(catalog: Catalog, domain: str, sealed: MapRecord, expected: int | AnyVersion | None) -> None:
     """Let a version serve that a job sealed, unless that was done before the job was interrupted.
 
-    Raises:
-        LostActivationError: Another version is active than the expected one.
+    Raises LostActivationError: another version is active than the expected one.
     """
     if sealed.activated_at is None:  # else it served already, and whoever rolled it back since meant it
         catalog.activate(domain, sealed.version, expected)

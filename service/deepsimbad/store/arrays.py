@@ -48,8 +48,7 @@ def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
 def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an array table, frozen; float16 comes back as float32.
 
-    Raises:
-        ValueError: The rows do not make up arrays.
+    Raises ValueError: the rows do not make up arrays.
     """
     arrays: dict[str, NDArray[Any]] = {}
     n_filled: dict[str, int] = {}
@@ -106,8 +105,7 @@ def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
 def load_packed(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
     """Read what `save_packed` or the first schema wrote, frozen; nothing where the map never learnt.
 
-    Raises:
-        ValueError: The row does not make up an array.
+    Raises ValueError: the row does not make up an array.
     """
     rows = list(db.table(table).rows_where("step IS NOT NULL"))
     if not rows:
@@ -133,11 +131,7 @@ def pack_texts(texts: NDArray[np.str_]) -> NDArray[np.uint8]:
 
 
 def unpack_texts(packed: NDArray[np.uint8], n_texts: int) -> NDArray[np.str_]:
-    """Back from `pack_texts`.
-
-    Raises:
-        ValueError: They are not so many texts.
-    """
+    """Back from `pack_texts`. Raises ValueError: they are not so many texts."""
     try:
         body = zlib.decompressobj().decompress(packed.tobytes(), n_texts * _TEXT_BYTES)
     except zlib.error as error:

@@ -122,12 +122,10 @@ class Catalog(MapCatalog, JobCatalog):
         row = {"evaluator": to_json(evaluator), "closed": int(closed), "actions_m": to_json(moves_m)}
         with self._writing() as db:
             for record in read_domains(db, name):
-                moves_m = list(record.actions_m)
-                present = {"evaluator": record.evaluator, "closed": record.closed, "actions_m": moves_m}
-                if to_json(present) != wanted:
+                if to_json(record.configuration) != wanted:
                     raise DomainDiffersError(
                         f"domain {name} exists with another configuration: delete it first, or choose another name",
-                        present=present,
+                        present=record.configuration,
                     )
                 return record, False
             n_domains = db.table("domain").count

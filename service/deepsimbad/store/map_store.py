@@ -56,8 +56,7 @@ class MapStore:
     def entries(self, after: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """The log's entries behind a number, each with its own; one request where there is none yet.
 
-        Raises:
-            UnavailableError: The entry of that number is gone, and the log with it.
+        Raises UnavailableError: the entry of that number is gone, and the log with it.
         """
         n_at_once = 1
         while True:
@@ -101,8 +100,7 @@ class MapStore:
     def put_map(self, path: Path, sha256: str, n_bytes: int) -> None:
         """Make a sealed file an object, unless it is one.
 
-        Raises:
-            DamagedMapError: The file is missing, or not the one that was sealed.
+        Raises DamagedMapError: the file is missing, or not the one that was sealed.
         """
         if self._objects.size(_map_name(sha256)) != n_bytes:
             verify(path, sha256)

@@ -66,6 +66,11 @@ class DomainRecord:
     created_at: str
     options: dict[str, Any]
 
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """What it was made with and keeps."""
+        return {"evaluator": self.evaluator, "closed": self.closed, "actions_m": list(self.actions_m)}
+
 
 _SELECT_DOMAIN = """
     SELECT domain.name, evaluator, closed, actions_m, active.version, domain.created_at, options

@@ -192,12 +192,11 @@ class SharedCatalog(Catalog):
         """Let a domain be what the log says; raises DomainDiffersError where another of its name was made here."""
         about = {key: state[key] for key in ("evaluator", "closed", "actions_m")}
         for record in read_domains(db, name):
-            present = {"evaluator": record.evaluator, "closed": record.closed, "actions_m": list(record.actions_m)}
-            if to_json(present) != to_json(about):
+            if to_json(record.configuration) != to_json(about):
                 raise DomainDiffersError(
                     f"domain {name} of {self.data_dir} has another configuration than that of the map store: delete "
                     "one of the two first",
-                    present=present,
+                    present=record.configuration,
                 )
         self._finish_deletion(db, name)
         db.execute(
@@ -484,9 +483,7 @@ def _state_of(db: Database, name: str) -> _State:
     """What the log says of a domain, None where there is none."""
     for record in read_domains(db, name):
         return {
-            "evaluator": record.evaluator,
-            "closed": record.closed,
-            "actions_m": list(record.actions_m),
+            **record.configuration,
             "options": record.options,
             "created_at": record.created_at,
             "map": next(iter(_maps(db, name, "active")), None),

@@ -1,11 +1,13 @@
 """Passive replays against the real service: what is scored, what is kept, and how they go on."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from deepsimbad.core.route import Route
 from deepsimbad_client import errors
@@ -181,8 +183,13 @@ def test_summary_counts_what_it_leaves_out():
     json.dumps(empty, allow_nan=False)
 
 
+@dataclass
+class Number:
+    n: int
+
+
 def journal(folder, identity, *, restart=False):
-    return Journal(folder, "records.jsonl", identity, lambda document: int(document["n"]), "number", restart=restart)
+    return Journal(folder, "records.jsonl", identity, TypeAdapter(Number), "number", restart=restart)
 
 
 def test_a_journal_goes_on_after_a_torn_line_and_is_not_mixed_with_another_replays(tmp_path):
@@ -193,10 +200,10 @@ def test_a_journal_goes_on_after_a_torn_line_and_is_not_mixed_with_another_repla
     file = tmp_path / "new" / "records.jsonl"
     file.write_bytes(file.read_bytes()[:-3])
     with journal(tmp_path / "new", {"a": 1}) as log:
-        assert (log.earlier, log.document) == ([1], {"a": 1, "session_id": "s1"})
+        assert (log.earlier, log.document) == ([Number(1)], {"a": 1, "session_id": "s1"})
         log.append({"n": 3})
     with journal(tmp_path / "new", {"a": 1}) as log:
-        assert log.earlier == [1, 3]
+        assert log.earlier == [Number(1), Number(3)]
     with pytest.raises(errors.ReplayError, match="a 1, now 2"):
         journal(tmp_path / "new", {"a": 2})
     with journal(tmp_path / "new", {"a": 2}, restart=True) as log:

@@ -243,7 +243,6 @@ class Setup:
     map: Map
     update: UpdateRule
     action_std_m: float | None  # how far a move is trusted; None: as usual
-    same_route: SameRoute | None
 
 
 def run_nbv(
@@ -265,7 +264,6 @@ def run_nbv(
     """
     starts, fitter = starts_of(config, test), Fitter(evaluator, pictures, config.seed)
     results: dict[str, dict[str, list[Episode]]] = {}
-    same_route = None
     for name in _SETUPS:
         progress.stage(f"map ({name})")
         relevance, *_ = _setup(config, name)
@@ -275,7 +273,6 @@ def run_nbv(
         )
         progress.stage(f"train ({name})")
         setup = trained(config, name, built, progress.update)
-        same_route = setup.same_route
         views = views_of(measured(test, setup.map.landmark_model, evaluator))
         drive = TestDrive(views, test.route(), nearest_images(test, training))
         results[name] = {}
@@ -283,14 +280,13 @@ def run_nbv(
             progress.stage(f"{planner} ({name})")
             results[name][planner] = drive_planner(config, setup, planner, drive, starts, progress.update)
     block = (test.position_m[starts] // BLOCK_M).astype(np.int64)
-    return NbvReport(config, results["ours"], results["paper"], block, same_route)
+    return NbvReport(config, results["ours"], results["paper"], block, built.same_route)
 
 
 def starts_of(config: NbvConfig, test: Drive) -> NDArray[np.int64]:
     """The frames from which every planner starts.
 
-    Raises:
-        InvalidMapConfigError: The test traverse is shorter than an episode.
+    Raises InvalidMapConfigError: the test traverse is shorter than an episode.
     """
     travel_m = config.n_steps * max(config.actions_m)
     drive = TestDrive(Query.uninformative(1), test.route(), np.empty(0, np.int64))
@@ -314,7 +310,7 @@ def trained(config: NbvConfig, name: str, built: Built, on_progress: Callable[[f
         config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
     )
     q_values, _ = train_nnql(built.rehearsal, built.own, built.second, nnql, on_progress, available_cores())
-    return Setup(name, replace(built.map, q_values=q_values), update, action_std_m, built.same_route)
+    return Setup(name, replace(built.map, q_values=q_values), update, action_std_m)
 
 
 def drive_planner(

@@ -1,7 +1,8 @@
-"""The sessions of the whole fleet, as a list that the replicas are asked for."""
+"""What is listed of the whole fleet: sessions, by asking the replicas, and jobs, by asking those who administer."""
 
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from ray.exceptions import RayError
@@ -9,12 +10,12 @@ from ray.serve.exceptions import RayServeException
 from ray.serve.handle import DeploymentHandle
 
 from deepsimbad.errors import UnavailableError
+from deepsimbad.fleet.backend import AWAY_S, BRIEFLY_S
 from deepsimbad.fleet.placement import session_owners
-from deepsimbad.store.records import ListPage
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import JobRecord, ListPage
 from deepsimbad.store.sessions import ListedSession, SessionRecord
 from deepsimbad.store.shared_sessions import SharedSessionStore
-
-_TIMEOUT_S = 5.0
 
 
 class AllSessions(SharedSessionStore):
@@ -39,7 +40,7 @@ class AllSessions(SharedSessionStore):
             by_owner[session_owners(session_id, len(self.replicas))[0]].append(session_id)
         asked = [self.replicas[owner].listed.remote(session_ids) for owner, session_ids in by_owner.items()]
         try:
-            listed = [entry for answer in asked for entry in answer.result(timeout_s=_TIMEOUT_S)]
+            listed = [entry for answer in asked for entry in answer.result(timeout_s=BRIEFLY_S)]
         except (TimeoutError, RayError, RayServeException) as error:
             raise UnavailableError("a replica is away, so its sessions cannot be listed: try again") from error
         living = {
@@ -49,3 +50,29 @@ class AllSessions(SharedSessionStore):
         }
         last = newest[limit - 1][0] if len(newest) > limit else None
         return ListPage(tuple(living[number] for number in sorted(living, reverse=True)), last)
+
+
+class AllJobs:
+    """The jobs as one of several that administer sees them: its own, and those that the `others` are asked for."""
+
+    def __init__(self) -> None:
+        self.others: Sequence[DeploymentHandle[Any]] = ()
+
+    def newest(self, catalog: Catalog, domain: str | None, before: int | None, limit: int) -> ListPage[JobRecord, int]:
+        """As `Catalog.newest_jobs`, of all of them; those of one domain are its administrator's, which is asked."""
+        if domain is not None:
+            return catalog.newest_jobs(domain, before, limit)
+        asked = [other.jobs.remote(before, limit + 1) for other in self.others]
+        numbered = catalog.numbered_jobs(None, before, limit + 1)
+        try:
+            numbered += [entry for answer in asked for entry in answer.result(timeout_s=BRIEFLY_S)]
+        except (TimeoutError, RayError, RayServeException) as error:
+            for answer in asked:  # nobody waits for them any more
+                with suppress(RayError, RayServeException):  # which is what it would have answered
+                    answer.cancel()
+            raise UnavailableError(
+                "one of those that administer is away, so its jobs cannot be listed: try again, or ask for those of "
+                "one domain",
+                retry_after_s=AWAY_S,
+            ) from error
+        return ListPage.of(sorted(numbered, key=lambda entry: entry[0], reverse=True), limit)
