@@ -1,6 +1,6 @@
 """Two drives tried out: one is mapped, the other localized on it in order as one session, and held to the truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief.particles import BeliefFilter
 from deepsimbad.core.belief.summary import CONFIDENT_WITHIN_M
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.landmark_model import fitting_number
-from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.planners import CONSTANT
@@ -86,21 +87,18 @@ class TrialReport:
         """Those where some query fails, worst first."""
         return _stretches(self.queries, self.outcomes)
 
-    def share_within(self, metres: float) -> float:
-        """Percent of scored queries after which the session's likeliest place was no farther off; NaN without any."""
-        errors = [outcome.belief_error_m for outcome in self.outcomes if outcome.belief_error_m is not None]
-        return 100 * float(np.mean([error <= metres for error in errors])) if errors else float("nan")
-
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document, as `experiment vpr` has it."""
         errors = [outcome.error_m for outcome in self.outcomes if outcome.error_m is not None]
+        by_belief = [outcome.belief_error_m for outcome in self.outcomes if outcome.belief_error_m is not None]
+        near = [error_m <= CONFIDENT_WITHIN_M for error_m in by_belief]
         return {
             **told(self.scores, (1, 5)),
             "recall_at": {name: {str(n): r for n, r in each.recall_at.items()} for name, each in self.scores.items()},
             "n_map_images": self.map.n_images,
             "n_landmarks": self.map.n_landmarks,
             "error_m": {"median": _quantile(errors, 0.5), "p90": _quantile(errors, 0.9)},
-            "belief_within_5_m": self.share_within(CONFIDENT_WITHIN_M),
+            "belief_within_5_m": 100 * float(np.mean(near)) if near else float("nan"),
             "n_forgot": self.n_forgot,
             "fails": [asdict(stretch) for stretch in self.stretches],
             "index_bits_per_map_image": bits_per_map_image(self.map),
@@ -133,59 +131,45 @@ def run_trial(
     built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
     progress.stage("localize")
     views = views_of(measured(queries, built.map.landmark_model, evaluator))
-    session = _Session(built.map, views, queries)
     scorer, by_all, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
-    nearest = nearest_images(queries, database)
+    nearest, beliefs, n_forgot = nearest_images(queries, database), [], 0
     whole = relevances_by_all(built, views, moves_between(queries), stateless=False)
-    for row, (truth, of_all) in enumerate(zip(true_images, whole, strict=True)):
-        relevance, mass = session.look(row)
+    seen = zip(true_images, whole, _in_order(built.map, views, queries), strict=True)
+    for row, (truth, of_all, (relevance, belief, forgot)) in enumerate(seen):
         by_all.add(of_all, truth)
-        rank = scorer.add(relevance, truth)
+        rank, mass = scorer.add(relevance, truth), belief.mass
         outcomes.append(_outcome(built.map, relevance, mass, truth, rank, int(nearest[row])))
+        beliefs.append(belief.route.histogram_of(mass))
+        n_forgot += forgot
         progress.update((row + 1) / len(true_images))
     scores = {DEFAULT_RELEVANCE.value: scorer.result(), BRUTE_FORCE_U: by_all.result()}
     return TrialReport(
-        *(config, built.map, queries, outcomes, np.array(session.belief, np.float32), scores),
+        *(config, built.map, queries, outcomes, np.array(beliefs, np.float32), scores),
         {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
-        session.n_forgot,
+        n_forgot,
         built.warnings,
     )
 
 
-class _Session:
+def _in_order(map_: Map, views: Query, queries: Drive) -> Iterator[tuple[NDArray[np.float32], BeliefFilter, bool]]:
     """One robot on the query drive, which knows how far it moves.
 
-    Attributes:
-        belief: After each view, by equal parts of the route.
-        n_forgot: How often it began anew.
+    Yields the relevance of every map image to each view, [n], the belief after it, and whether it began anew.
     """
-
-    def __init__(self, map_: Map, views: Query, queries: Drive) -> None:
-        # Nobody follows its plans, and a constant planner's cost nothing.
-        self._localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{CONFIDENT_WITHIN_M:g}"))
-        self._state: LocalizerState = self._localizer.start()
-        self._views, self._moves_m = views, np.diff(queries.position_m, prepend=queries.position_m[0])
-        self.belief: list[NDArray[np.float64]] = []
-        self.n_forgot = 0
-
-    def look(self, row: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """The relevance of every map image to one view, [n], and their masses after it, [n]."""
-        view, move_m = self._views.at(row), float(self._moves_m[row])
+    # Nobody follows its plans, and a constant planner's cost nothing.
+    localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{CONFIDENT_WITHIN_M:g}"))
+    state = localizer.start()
+    for row, move_m in enumerate(np.diff(queries.position_m, prepend=queries.position_m[0]).tolist()):
+        view, forgot = views.at(row), False
         try:
-            state = self._localizer.step(self._state, view, move_m).state
+            state = localizer.step(state, view, move_m).state
         except PastTheEndError:  # it was taken for elsewhere: from knowing nothing, but what is usual, on
-            anew = self._localizer.with_prior(self._state, *_anywhere(self._state))
-            state, self.n_forgot = self._localizer.step(anew, view).state, self.n_forgot + 1
-        self._state, mass = state, state.belief.mass
-        self.belief.append(state.belief.route.histogram_of(mass))
+            route = state.belief.route
+            anew = localizer.with_prior(state, route.start_m + route.length_m / 2, 100 * max(route.length_m, 1.0))
+            state, forgot = localizer.step(anew, view).state, True
         if state.relevance is None:
             raise ValueError("a step leaves the view's relevance")
-        return state.relevance, mass
-
-
-def _anywhere(state: LocalizerState) -> tuple[float, float]:
-    route = state.belief.route
-    return route.start_m + route.length_m / 2, 100 * max(route.length_m, 1.0)
+        yield state.relevance, state.belief, forgot
 
 
 def _outcome(
