@@ -28,6 +28,7 @@ from deepsimbad_client.commands.console import (
 from deepsimbad_client.http.admin import follow_job
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Job, MapVersion
+from deepsimbad_client.recordings.options import camera_of_option
 
 asking = click.option("--yes", is_flag=True, help="Do not ask.")
 domain_argument = click.argument("domain")
@@ -249,12 +250,7 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
     help="Whether both drives count their positions along one route, so that the map may learn from two seasons of it; "
     "absent: only where both know x, y.",
 )
-@click.option(
-    "--camera-of",
-    metavar="DOMAIN",
-    help="Another domain of the same camera, mapped from two seasons of its route: where this route was seen in one, "
-    "what a season changes is learnt there.",
-)
+@camera_of_option
 @click.option("--wait/--no-wait", default=True, show_default=True, help="Follow the job to its end.")
 @json_flag
 @serving

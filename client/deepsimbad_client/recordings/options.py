@@ -25,6 +25,12 @@ rotate_option = click.option(
     callback=lambda _context, _parameter, value: None if value is None else int(value),
     help="Degrees clockwise by which every image is turned.  [default: NCLT's upright, others not at all]",
 )
+camera_of_option = click.option(
+    "--camera-of",
+    metavar="DOMAIN",
+    help="Another domain of the same camera, mapped from two seasons of its route: where this route was seen in one, "
+    "what a season changes is learnt there.",
+)
 _OPTIONS = (
     click.option(
         "--spacing-m",

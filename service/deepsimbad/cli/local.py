@@ -52,7 +52,15 @@ from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, views
+from deepsimbad_client.recordings.options import (
+    accounting,
+    camera_of_option,
+    opened,
+    reading,
+    rotate_option,
+    tell_left_out,
+    views,
+)
 
 Encode: TypeAlias = Callable[[Recording, Evaluator, Callable[[float], None]], Iterable[EncodedBlock] | None]
 """Encodes a recording elsewhere, telling how far it is; None: it is encoded here."""
@@ -88,12 +96,7 @@ def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str 
     help="Whether both recordings count their positions along one route, so that the map may learn from two seasons of "
     "it.  [default: where both know x, y]",
 )
-@click.option(
-    "--camera-of",
-    metavar="DOMAIN",
-    help="Another domain of the same camera, mapped from two seasons of its route: where this route was seen in one, "
-    "what a season changes is learnt there.",
-)
+@camera_of_option
 @click.option("--closed", is_flag=True, help="The end of the route joins its start.")
 @click.option(
     "--thumbnails/--no-thumbnails",

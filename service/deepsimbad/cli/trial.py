@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from deepsimbad.cli.experiment import json_file_option, kept_in, tell, tolerance_option, true_images, usual_tolerance_m
-from deepsimbad.cli.terminal import (
-    data_dir_option,
-    evaluator_option,
-    given_settings,
-    print_table,
-    progress_bar,
-    render,
-)
+from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar, render
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError
@@ -32,14 +25,7 @@ from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments.kept import kept_encodings
-from deepsimbad.jobs.experiments.trial import (
-    RECALL_RANKS,
-    TRIAL_STAGES,
-    Stretch,
-    TrialConfig,
-    TrialReport,
-    run_trial,
-)
+from deepsimbad.jobs.experiments.trial import RECALL_RANKS, TRIAL_STAGES, Stretch, TrialConfig, TrialReport, run_trial
 from deepsimbad.jobs.experiments.truth import known_drives
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad.jobs.fitting import RecordingPictures

@@ -29,9 +29,10 @@ _SELECT = """
       ON latest.session = session.number
      AND latest.sequence = (SELECT max(sequence) FROM journal WHERE session = session.number)
 """
-_INSERT_SESSION = """
-    INSERT INTO session (session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
-    VALUES (?, ?, ?, ?, ?, ?, ?, ?)
+INSERT_SESSION = """
+    INSERT INTO session
+        (number, session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING
 """
 INSERT_ROW = """
     INSERT INTO journal (session, sequence, kind, written_at, expires_at, idempotency_key, request_digest,
@@ -163,7 +164,7 @@ class SessionStore(OpenFile):
         """Keep a new session; answers with the number that it got, or the session that has this id already."""
 
         def write(db: Database) -> SessionRecord:
-            db.conn.execute(f"{_INSERT_SESSION} ON CONFLICT (session_id) DO NOTHING", session_columns(record))
+            db.conn.execute(INSERT_SESSION, (None, *session_columns(record)))  # None: the next number
             return _get(db, record.session_id)
 
         return self._commits.submit(write)

@@ -27,6 +27,7 @@ from deepsimbad.errors import SessionMovedError, UnknownSessionError
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.sessions import (
     INSERT_ROW,
+    INSERT_SESSION,
     JournalRow,
     ListedSession,
     SessionRecord,
@@ -45,12 +46,6 @@ _MANY_ROWS = 16  # from so many on a snapshot is looked for
 _NO_KEY = "-"
 _KEPT_S = 60.0  # that a list of who lives stands, to which those are added that began since
 _LATE_S = 60.0  # by which clocks may differ, or a mark be written after its session's beginning
-# Numbers order sessions by their beginning, to ten microseconds, and are the same on every node.
-_INSERT_SESSION = """
-    INSERT OR IGNORE INTO session
-        (number, session_id, domain, map_version, map_sha256, config, created_at, expires_at, key_id)
-    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
-"""
 
 
 @dataclass(frozen=True)
@@ -308,8 +303,9 @@ class SharedSessionStore(SessionStore):
 
 
 def _insert_session(db: Database, columns: Sequence[Any]) -> None:
+    # Numbers order sessions by their beginning, to ten microseconds, and are the same on every node.
     number = _number_at(columns[_CREATED_AT]) + int(columns[0][-4:], 16) % 1000
-    db.conn.execute(_INSERT_SESSION, (number, *columns))
+    db.conn.execute(INSERT_SESSION, (number, *columns))
 
 
 def _number_at(created_at: float) -> int:
