@@ -91,7 +91,7 @@ class Call:
     def with_json(cls, method: str, path: str, document: Mapping[str, Any], **more: Any) -> "Call":
         """A call whose body is a document, absent (None) values left out; raises InvalidArgumentError for NaN."""
         try:
-            body = json.dumps({key: value for key, value in document.items() if value is not None}, allow_nan=False)
+            body = json_of({key: value for key, value in document.items() if value is not None})
         except (TypeError, ValueError) as error:
             raise InvalidArgumentError(f"cannot be sent as JSON: {error}") from error
         more["headers"] = {"Content-Type": "application/json", **more.get("headers", {})}
@@ -182,7 +182,7 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
     if isinstance(form, Observation):
         return form
     try:
-        text = json.dumps({name: _plain(form)}, allow_nan=False, separators=(",", ":"))
+        text = json_of({name: _plain(form)})
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(f"{name} must be plain numbers without NaN or infinity: {error}") from error
     return Observation(text.encode(), "application/json")
@@ -193,9 +193,8 @@ def observed(told: Mapping[str, Any], image: bytes | None = None) -> Observation
     told = {name: value if isinstance(value, str) else list(value) for name, value in told.items()}
     try:
         if image is None:
-            return Observation(json.dumps(told, allow_nan=False).encode(), "application/json")
-        parts = {name: value if isinstance(value, str) else json.dumps(value, allow_nan=False)
-                 for name, value in told.items()}  # fmt: skip
+            return Observation(json_of(told).encode(), "application/json")
+        parts = {name: value if isinstance(value, str) else json_of(value) for name, value in told.items()}
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(f"objects and text must be plain JSON: {error}") from error
     content = {"image": image, **{name: value.encode() for name, value in parts.items()}}
@@ -245,8 +244,24 @@ def known_positions(true_positions_m: Numbers) -> list[float | None]:
     return [None if isinstance(value, float) and math.isnan(value) else value for value in _plain(true_positions_m)]
 
 
+def json_of(value: Any) -> str:
+    """JSON in few bytes, numpy's numbers as Python's; raises TypeError or ValueError for what it cannot say, as NaN."""
+
+    def known(strange: Any) -> Any:
+        if (plain := of_python(strange)) is strange:
+            raise TypeError(f"{type(strange).__name__} is no number")
+        return plain
+
+    return json.dumps(value, allow_nan=False, separators=(",", ":"), default=known)
+
+
+def of_python(value: Any) -> Any:
+    """A number or an array of numpy's as Python has it; all else as it is."""
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
 def _plain(values: Any) -> list[Any]:
-    return list(values.tolist() if hasattr(values, "tolist") else values)
+    return [of_python(value) for value in of_python(values)]
 
 
 def problem_of(response: httpx2.Response) -> dict[str, Any]:

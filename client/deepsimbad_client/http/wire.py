@@ -29,6 +29,7 @@ from deepsimbad_client.http import (
     Model,
     Repeat,
     model_of,
+    of_python,
     page_of,
     problem_of,
     raise_for_problem,
@@ -248,10 +249,9 @@ class Wire:
                 raise InvalidArgumentError(
                     f"{headers[REQUEST_ID]!r} cannot name a request: use 1 to 64 letters, digits, '.', '_' and '-'"
                 )
+        given = {name: of_python(value) for name, value in call.params.items() if value is not None}
         params = {
-            name: str(value) if isinstance(value, str | float | int) else list(value)
-            for name, value in call.params.items()
-            if value is not None
+            name: str(value) if isinstance(value, str | float | int) else list(value) for name, value in given.items()
         }
         return self.link.http.build_request(
             call.method, call.path, params=params or None, headers=headers, content=call.body

@@ -44,6 +44,12 @@ def test_localize_reads_the_whole_answer_and_what_it_does_not_know_yet():
         ({"ranked_landmarks": np.array([4, 2], np.uint16)}, {"ranked_landmarks": [4, 2]}),
         ({"dissimilarities": np.array([0.5], np.float32)}, {"dissimilarities": [0.5]}),
         ({"encoding": [1.0]}, {"encoding": [1.0]}),
+        ({"ranked_landmarks": list(np.array([4, 2]))}, {"ranked_landmarks": [4, 2]}),
+        ({"encoding": tuple(np.array([0.5, 1], np.float32))}, {"encoding": [0.5, 1.0]}),
+        (
+            {"objects": [{"label": "car", "box": list(np.eye(4, dtype=np.float32)[3]), "score": np.float32(0.5)}]},
+            {"objects": [{"label": "car", "box": [0, 0, 0, 1], "score": 0.5}]},
+        ),
     ],
 )
 def test_what_a_robot_encodes_itself_travels_as_json(form, body):
@@ -56,6 +62,7 @@ def test_what_a_robot_encodes_itself_travels_as_json(form, body):
 def test_what_can_never_be_sent_is_refused_here(tmp_path):
     images = ({"image": b"\xff\xd8\xff", "encoding": [1.0]}, {"image": b"GIF89a"})
     numbers = ({"dissimilarities": [float("nan")]}, {"encoding": np.array([np.inf])}, {"ranked_landmarks": [object()]})
+    numbers += ({"encoding": [np.float32("nan")]},)
     for form in ({}, *images, *numbers):
         with pytest.raises(InvalidArgumentError):
             observation(**form)

@@ -70,6 +70,19 @@ def test_what_travels(client, link, views):
     assert len(bare.headers["idempotency-key"]) >= 16
 
 
+def test_numbers_may_be_those_of_numpy(client, link, views):
+    """As they come out of arrays, one at a time."""
+    with client.session("route", np.float32(12.5), np.int64(3), seed=np.int64(7)) as session:
+        session.observe(encoding=views[12], action_m=np.float32(1.5), shortlist=np.int64(3))
+        score = session.truths([np.float32(12)])
+        assert (score.n_scored, score.n_left_out) == (1, 0)
+        score = session.truths([np.float32("nan")])
+        assert (score.n_scored, score.n_left_out) == (0, 1)
+    created, observed, *_ = link.requests
+    assert json.loads(created.content) == {"start_position_m": 12.5, "start_std_m": 3, "seed": 7}
+    assert observed.url.query == b"action_m=1.5&shortlist=3"
+
+
 def test_an_observation_whose_answer_was_lost_counts_once(client, link, views):
     lost = iter([False, True, True, False, True, False])
     link.lose = lambda request: "observations" in request.url.path and next(lost)
