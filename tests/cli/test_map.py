@@ -114,10 +114,10 @@ def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
 
 
 def test_two_seasons_are_learnt_from_where_the_route_is_said_to_be_one(deepsimbad, drives):
-    """Of drives without x, y; and where their views differ, people are told."""
+    """Of drives without x, y; and where their views differ, or too few are of the same places, people are told."""
 
-    def made(landmarks, *said):
-        pair = ("--landmarks", drives / f"{landmarks}.npy", "--training", drives / "summer.npy")
+    def made(landmarks, *said, part=""):
+        pair = ("--landmarks", drives / f"{landmarks}.npy", "--training", f"{drives / 'summer.npy'}{part}")
         ran = deepsimbad("map", landmarks, *pair, *READY, "--n-landmarks", 40, "--training-episodes", 0, *said)
         assert ran.code == 0, ran.err
         return ran
@@ -129,6 +129,9 @@ def test_two_seasons_are_learnt_from_where_the_route_is_said_to_be_one(deepsimba
     assert [season["accepted"] for season in same] == [False, True, False]
     assert made("winter", "--same-route").err == made("landmarks").err == ""
     assert "it learnt nothing of a second season: at equal positions" in made("landmarks", "--same-route").err
+    few = made("winter", "--same-route", part="#:29").err
+    assert "it learnt nothing of a second season: the two drives share 29 places by their positions" in few
+    assert "second season" not in made("winter", part="#:29").err
 
 
 def test_the_data_directory_comes_from_the_flag_the_environment_or_here(deepsimbad, drives, tmp_path, monkeypatch):
