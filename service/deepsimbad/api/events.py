@@ -33,8 +33,9 @@ def _observed(view: SessionView) -> SessionAnswer:
     dependencies=[Depends(room_for_a_stream)],
     responses={
         200: {
-            "description": "`observation` events: what each observation was answered, its timings apart; `prior` "
-            "events with the session as somebody's word left it; `done` when the session has ended. Ids count from 1."
+            "description": "`observation` events: what each observation was answered; its timings, remarks on its "
+            "picture and how long its lists were asked to be are apart. `prior` events with the session as somebody's "
+            "word left it; `done` when the session has ended. Ids count from 1."
         },
         **problems(404, 410, 422),
     },

@@ -59,9 +59,9 @@ class SessionEvents:
             live = self._sessions.living(record.session_id)
             latest = None if live is None else live.state
             rows: list[JournalRow] = []
-            if latest is not None and latest.sequence == state.sequence + 1 >= first:
+            if live is not None and latest is not None and latest.sequence == state.sequence + 1 >= first:
                 state = latest
-                yield await self._told(record, state)
+                yield await self._told(record, state, live.expires_at)
                 continue
             if latest is None or latest.sequence != state.sequence:
                 span = (record.number, state.sequence, state.sequence + _ROWS_AT_ONCE)
@@ -69,7 +69,7 @@ class SessionEvents:
             for row in rows:
                 state = await self._worked(partial(state.followed, row))
                 if row.sequence >= first:
-                    yield await self._told(record, state)
+                    yield await self._told(record, state, row.expires_at)
             if rows:
                 continue
             if live is None:
@@ -77,9 +77,8 @@ class SessionEvents:
             yield None
             await asyncio.sleep(_GLANCE_S if latest is not None else self._poll_s)
 
-    async def _told(self, record: SessionRecord, state: SessionState) -> SessionEvent:
-        live = self._sessions.living(record.session_id) or LiveSession(record, record.expires_at)
-        view = await asyncio.to_thread(view_of, live, live.expires_at, state)
+    async def _told(self, record: SessionRecord, state: SessionState, expires_at: float) -> SessionEvent:
+        view = await asyncio.to_thread(view_of, LiveSession(record, expires_at), expires_at, state)
         return SessionEvent(state.sequence, view, state.step is not None)
 
     async def _worked(self, compute: Callable[[], SessionState]) -> SessionState:
