@@ -4,36 +4,44 @@ Exit codes: 0 done, 1 a named error (one line on standard error, `deepsimbad: CO
 """
 
 import logging
+from collections import UserDict
 from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
 
 import click
 
-from deepsimbad.cli.experiment import experiment
-from deepsimbad.cli.local import delete_domain, info, localize, map_
-from deepsimbad.cli.paper import paper
-from deepsimbad.cli.ray import ray
-from deepsimbad.cli.serve import init, keys, serve, settings
-from deepsimbad.cli.storage import backup, check, export, import_, restore
-from deepsimbad.cli.trial import try_
-from deepsimbad.cli.weights import weights
 from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
 from deepsimbad_client.errors import DeepSimbadClientError
 
 _FAILED, _CANCELLED = 1, 130
+_HOMES = {
+    "experiment": "paper:experiment",
+    "ray": "ray:ray",
+    "try": "trial:try_",
+    "weights": "weights:weights",
+    **{name: f"serve:{name}" for name in ("init", "keys", "serve", "settings")},
+    **{name: f"storage:{name}" for name in ("backup", "check", "export", "restore")},
+    **{name: f"local:{name}" for name in ("info", "localize")},
+    "delete-domain": "local:delete_domain",
+    "import": "storage:import_",
+    "map": "local:map_",
+}
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class _Late(UserDict[str, Any]):
+    """Commands, each imported when it is asked for: most take half a second of imports that others do without."""
+
+    def __getitem__(self, name: str) -> click.Command:
+        module, _, attribute = self.data[name].partition(":")
+        command: click.Command = getattr(import_module(f"{__name__}.{module}"), attribute)
+        return command
+
+
+@click.group(commands=_Late(_HOMES), context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="deep-simbad", message="%(version)s")
 def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""
-
-
-for command in (
-    *(init, serve, map_, localize, try_, info, delete_domain, experiment, keys, settings),
-    *(backup, restore, export, import_, check, weights, ray),
-):
-    deepsimbad.add_command(command)
-experiment.add_command(paper)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, json_file_option, kept_in, tell, tolerance_option
+from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, experiment, json_file_option, kept_in, tell, tolerance_option
 from deepsimbad.cli.paper_page import write_report
 from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar
 from deepsimbad.core.composed import MOST_DIMENSIONS
@@ -48,7 +48,7 @@ _ENCODE_S = 0.05  # a frame, on one core of a server's
 _MOST_POINTS = 400  # of a trajectory as it is drawn
 
 
-@click.command()
+@experiment.command()
 @click.option(
     "--nclt", "root", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder of drives."
 )

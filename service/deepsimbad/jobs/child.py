@@ -8,6 +8,7 @@ Nothing heavy is imported before the priority is low: threads inherit it from th
 
 import ctypes
 import faulthandler
+import gc
 import json
 import logging
 import os
@@ -99,6 +100,7 @@ def main() -> None:
     logging.getLogger("deepsimbad").setLevel(order["log_level"])
     logging.captureWarnings(True)
 
+    gc.disable()  # imports leave little behind, and looking for it would be an eighth of them
     from pydantic import TypeAdapter  # noqa: PLC0415 - nothing heavy before the priority is low
 
     from deepsimbad.errors import DeepSimbadError  # noqa: PLC0415
@@ -106,6 +108,8 @@ def main() -> None:
     from deepsimbad.jobs.runner import InThisProcess  # noqa: PLC0415
     from deepsimbad.store.records import JobRecord  # noqa: PLC0415
 
+    gc.freeze()
+    gc.enable()
     job = TypeAdapter(JobRecord).validate_python(order["job"])
     compute = TypeAdapter(Compute).validate_python(order["compute"])
     run_job = InThisProcess(Path(order["data_dir"]), order["n_threads"], compute)
