@@ -1,10 +1,9 @@
-"""What an observation of a few bytes costs: ANR of the m nearest landmarks against that of all ranks.
+"""What an observation of a few bytes costs: ANR against that of sending all ranks.
 
     python -m bench.onboard
 
-A robot that encodes on board sends m landmark ids. Landmarks that it does not send are judged by what is usual for
-them and by how they go together (`deepsimbad.core.descriptor`); the table shows beside it what came of giving each the
-mean of the ranks left.
+A robot that encodes on board sends its unit encoding in a few bits a number, or m landmark ids. Landmarks that it does
+not send are judged by what is usual for them and by how they go together (`deepsimbad.core.descriptor`).
 """
 
 import itertools
@@ -20,24 +19,25 @@ from numpy.typing import NDArray
 from bench.common import machine, markdown, real_recordings, write_page
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
 from deepsimbad.core.building import MapPlan
-from deepsimbad.core.descriptor import (
-    pack_ranked_landmarks,
-    ranks_from_ranked_landmarks,
-)
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.on_board import pack_ranked_landmarks, pack_unit_encoding, ranked_landmarks_within
+from deepsimbad.core.relevance import Relevance
+from deepsimbad.engine.localizer import PackedRanks, PackedUnitEncoding, describe
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.space import unit_vectors
 from deepsimbad.jobs.build import build, measured, views_of
 
 N_LANDMARKS, N_SENT = (128, 256, 300, 500), (8, 16, 32, 48)  # and as many as the budget holds
+N_BITS = (3, 4, 5, 8)  # a number of a unit encoding
 LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
 _DRIVES = ("nr", "nq", "nq2")
 _IMAGES_A_BLOCK = 16
+_EVALUATOR = FeatureL2("none")
 
 
 @dataclass(frozen=True)
@@ -56,39 +56,47 @@ class Drives:
     position: NDArray[np.int64]
     is_of_two_seasons: bool
 
-    def views(self, relevance: Relevance, n_landmarks: int) -> tuple[Map, NDArray[np.float32]]:
-        """The map, and the ranks of the test frames, [n, r]."""
-        evaluator = FeatureL2("none")
-        landmarks, training, test = (
-            Drive(position_m=np.arange(float(len(rows))), encodings=rows)
-            for rows in (self.landmarks, self.training, self.test)
+    def map(self, relevance: Relevance, n_landmarks: int) -> Map:
+        """Built of the training drive."""
+        landmarks, training = (
+            Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in (self.landmarks, self.training)
         )
         second = landmarks if self.is_of_two_seasons else None
         plan = MapPlan(relevance, LIST_LENGTH, (1.0,), same_route=True)
-        built = build(plan, training, second, landmarks, n_landmarks, evaluator).map
-        return built, views_of(measured(test, built.landmark_model, evaluator)).ranks
+        return build(plan, training, second, landmarks, n_landmarks, _EVALUATOR).map
 
 
-def anr(drives: Drives, built: Map, ranks: NDArray[np.float32], m: int, how: str) -> tuple[float, float]:
+def ranked(drives: Drives, built: Map, m: int) -> list[PackedRanks]:
+    """What a robot sends of every test frame, by its m nearest landmarks."""
+    test = Drive(position_m=np.arange(float(len(drives.test))), encodings=drives.test)
+    ranks = views_of(measured(test, built.landmark_model, _EVALUATOR)).ranks
+    return [PackedRanks(pack_ranked_landmarks(np.argsort(row)[:m].tolist(), built.n_landmarks)) for row in ranks]
+
+
+def encoded(drives: Drives, built: Map, n_bits: int) -> list[PackedUnitEncoding]:
+    """The same by its unit encoding."""
+    return [PackedUnitEncoding(pack_unit_encoding(u, n_bits)) for u in unit_vectors(drives.test, built.landmark_model)]
+
+
+def anr(drives: Drives, built: Map, views: Sequence[PackedRanks | PackedUnitEncoding], how: str) -> tuple[float, float]:
     """ANR in percent over the test drive, and milliseconds a view.
 
     Args:
         drives: Where the test frames were taken.
         built: The map.
-        ranks: [n, r] of the test frames.
-        m: How many landmarks a view sends.
+        views: What was sent of every test frame.
         how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's.
     """
     scorer, spent_s = RetrievalScorer(), 0.0
     live = built.live_statistics
-    for frame, all_ranks in enumerate(ranks):
-        query = Query(ranks_from_ranked_landmarks(np.argsort(all_ranks)[:m].tolist(), ranks.shape[1]))
+    for frame, view in enumerate(views):
+        query = describe(built, _EVALUATOR, view)
         began = time.perf_counter()
         live = live.observing(query) if live is not None and how == "session" else live
         relevance = relevances(built, query, live)
         spent_s += time.perf_counter() - began
         scorer.add(relevance, np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE))
-    return scorer.result().anr, 1000 * spent_s / len(ranks)
+    return scorer.result().anr, 1000 * spent_s / len(views)
 
 
 def netvlad(folder: Path) -> list[Drives]:
@@ -119,55 +127,74 @@ def _encoded(evaluator: Evaluator, season: Path, numbers: Sequence[int]) -> NDAr
 
 
 def table(triplets: Sequence[Drives]) -> Iterator[str]:
-    """A Markdown line for every r and m, each figure the mean over the triplets."""
-    head = (
-        "r",
-        "m",
-        "bytes",
-        "**composed**",
-        "composed, views alone",
-        "rrf",
-        "ms a view",
-    )
+    """A Markdown line for every r and body, each figure the mean over the triplets."""
+    head = ("r", "sent", "bytes", "**composed**", "composed, views alone", "rrf", "ms a view")
     return markdown(head, (row for n_landmarks in N_LANDMARKS for row in _rows(triplets, n_landmarks)))
 
 
 def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
-    composed = [(drives, *drives.views(Relevance.COMPOSED, n_landmarks)) for drives in triplets]
-    rrf = [(drives, *drives.views(Relevance.RRF, n_landmarks)) for drives in triplets]
+    composed = [(drives, drives.map(Relevance.COMPOSED, n_landmarks)) for drives in triplets]
+    rrf = [(drives, drives.map(Relevance.RRF, n_landmarks)) for drives in triplets]
     columns = ((composed, "session"), (composed, "alone"), (rrf, "session"))
-    whole: list[float] = []
-    most = next(
-        m for m in range(n_landmarks, 0, -1) if len(pack_ranked_landmarks(range(m), n_landmarks)) <= BUDGET_BYTES
-    )
-    for m in (n_landmarks, *N_SENT, most):
-        figures = np.array([[anr(*each, m, how) for each in maps] for maps, how in columns])
-        means = figures[:, :, 0].mean(axis=1).tolist()
-        whole = whole or means
-        n_bytes = len(pack_ranked_landmarks(range(m), n_landmarks))
-        shown = f"{'all' if m == n_landmarks else m}{' **(64 bytes)**' if n_bytes == BUDGET_BYTES else ''}"
-        costs = [
-            f"{value:.2f}" + ("" if m == n_landmarks else f" ({100 * (value / best - 1):+.0f} %)")
-            for value, best in zip(means, whole, strict=True)
+    all_ranks: list[float] = []
+    for m in (n_landmarks, *N_SENT, ranked_landmarks_within(BUDGET_BYTES, n_landmarks)):
+        sent = [[ranked(drives, built, m) for drives, built in maps] for maps, _ in columns]
+        means, ms = _means(columns, sent)
+        all_ranks = all_ranks or means
+        what = "all ranks" if m == n_landmarks else f"{m} ranks"
+        yield [str(n_landmarks), what, _bytes(sent), *_costs(means, all_ranks), ms]
+    for n_bits in N_BITS:
+        sent = [[encoded(drives, built, n_bits) for drives, built in maps] for maps, _ in columns[:2]]
+        means, ms = _means(columns[:2], sent)
+        yield [str(n_landmarks), f"u, {n_bits} bits a number", _bytes(sent), *_costs(means, all_ranks), "", ms]
+
+
+def _means(
+    columns: Sequence[tuple[Sequence[tuple[Drives, Map]], str]],
+    sent: Sequence[Sequence[Sequence[PackedRanks | PackedUnitEncoding]]],
+) -> tuple[list[float], str]:
+    """ANR of every column, and the milliseconds a view of the first."""
+    figures = np.array(
+        [
+            [anr(drives, built, views, how) for (drives, built), views in zip(maps, by_map, strict=True)]
+            for (maps, how), by_map in zip(columns, sent, strict=True)
         ]
-        yield [str(n_landmarks), shown, str(n_bytes), *costs, f"{figures[0, :, 1].mean():.1f}"]
+    )
+    return figures[:, :, 0].mean(axis=1).tolist(), f"{figures[0, :, 1].mean():.1f}"
+
+
+def _bytes(sent: Sequence[Sequence[Sequence[PackedRanks | PackedUnitEncoding]]]) -> str:
+    n_bytes = len(sent[0][0][0].body)
+    return f"**{n_bytes}**" if n_bytes <= BUDGET_BYTES else str(n_bytes)
+
+
+def _costs(means: Sequence[float], all_ranks: Sequence[float]) -> list[str]:
+    """ANR, and how much worse than that of all ranks."""
+    costs = [f"{100 * (value / best - 1):+.0f} %" for value, best in zip(means, all_ranks, strict=False)]
+    return [
+        f"{value:.2f}" if means is all_ranks else f"{value:.2f} ({cost})"
+        for value, cost in zip(means, costs, strict=True)
+    ]
 
 
 def report(recordings: Path) -> Iterator[str]:
     """The lines of the page."""
     yield from ("# Encoding on board: what an observation of a few bytes costs", "")
     yield (
-        "A robot that encodes on board sends its m nearest landmarks as `application/vnd.deepsimbad.ranks`: two bytes "
-        "and ceil(log2 r) bits a landmark. ANR in percent (0 is perfect, 50 chance) and, in brackets, how much worse "
-        f"that is than sending all ranks. h = {LIST_LENGTH}, tolerance {TOLERANCE} frames; one session over the test "
-        "drive in order, but for `views alone` (each by the map's statistics, as single localizations are answered)."
+        "A robot that encodes on board sends its unit encoding u as `application/vnd.deepsimbad.unit-encoding`, a few "
+        "bits a number, or its m nearest landmarks as `application/vnd.deepsimbad.ranks`, two bytes and ceil(log2 r) "
+        "bits a landmark. ANR in percent (0 is perfect, 50 chance) and, in brackets, how much worse that is than "
+        f"sending all ranks; bodies of at most {BUDGET_BYTES} bytes are in bold. h = {LIST_LENGTH}, tolerance "
+        f"{TOLERANCE} frames; one session over the test drive in order, but for `views alone` (each by the map's "
+        "statistics, as single localizations are answered)."
     )
     yield ""
     yield (
-        "`composed` is the default: of a landmark that was not sent the score is the expected one, given the "
-        "landmarks that were, how landmarks went together over the map's drive, and that it is farther than the last "
-        "that was sent; its evidence counts by how much of it is known. `rrf` has no statistics and takes "
-        "the mean of the ranks left. Times are those of `composed` in a session, statistics and relevance, on a "
+        "`composed` is the default. Of u the products with all landmarks follow, and a session moves and scales them "
+        "by what is usual in it. Of a landmark that was not sent the score is the expected one, given the landmarks "
+        "that were, how landmarks went together over the map's drive, and that it is farther than the last that was "
+        "sent; its evidence counts by how much of it is known. `rrf`, which compares ranks, has no statistics and "
+        "takes the mean of the ranks left. Times are those of `composed` in a session, statistics and relevance, on a "
         "machine shared with other work."
     )
     yield from ("", "Made by `python -m bench.onboard`.", "", machine(), "", "## NetVLAD encodings of Nordland", "")

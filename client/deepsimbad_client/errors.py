@@ -197,7 +197,7 @@ class LandmarkModelDiffersError(
     code="landmark_model_differs",
     advice="`client.on_board(domain, map_version={map_version})` fetches it",
 ):
-    """The view was ranked by another landmark model than the answering map's: fetch the `map_version` of `problem`."""
+    """The view was made by another landmark model than the answering map's: fetch the `map_version` of `problem`."""
 
 
 class FramesDifferError(ConflictError, code="frames_differ"):

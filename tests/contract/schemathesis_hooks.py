@@ -40,6 +40,10 @@ schemathesis.openapi.media_type(
         st.binary(max_size=8),
     ),
 )
+schemathesis.openapi.media_type(
+    "application/vnd.deepsimbad.unit-encoding",
+    st.one_of(st.binary(min_size=3, max_size=3).map(lambda codes: b"\x03" + codes), st.binary(max_size=8)),
+)
 
 
 @schemathesis.hook

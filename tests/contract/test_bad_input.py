@@ -68,7 +68,8 @@ def claimed_png(width, height):
 
 
 IMAGES = ["image/jpeg", "image/png", "image/tiff", "image/webp"]
-TAKEN = {"allowed": [*IMAGES, "application/json", "application/vnd.deepsimbad.ranks"]}
+PACKED = ("application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding")
+TAKEN = {"allowed": [*IMAGES, "application/json", *PACKED]}
 KNOWN = {"allowed": [*TAKEN["allowed"], "text/plain", "multipart/form-data"]}
 
 

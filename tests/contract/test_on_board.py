@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from deepsimbad.core.descriptor import pack_ranked_landmarks
+from deepsimbad.core.on_board import pack_ranked_landmarks, pack_unit_encoding
 from deepsimbad_client import Client, Observation
 from deepsimbad_client.errors import LandmarkModelDiffersError
 from deepsimbad_client.http.on_board import OnBoardEncoder
@@ -26,6 +26,7 @@ from .conftest import (
 )
 
 PACKED = {"Content-Type": "application/vnd.deepsimbad.ranks"}
+PACKED_UNIT = {"Content-Type": "application/vnd.deepsimbad.unit-encoding"}
 READY = "/v1/domains/ready/localizations"
 MODEL = "/v1/domains/ready/landmark-model"
 # Of 10 landmarks an id takes four bits; m = 3, then 7, 2 and 9, and four zero bits.
@@ -116,6 +117,31 @@ def test_bad_ranks(post, body):
     problem(post(content=b"", headers=PACKED), 422, "empty_body")
 
 
+def test_a_unit_encoding_by_hand_is_answered_as_its_dissimilarities(client):
+    u = np.array([3, 0, -2, 0, 1, 0, 0, 0])
+    # Three bits: 6, 3, 1, 3, 4 and three times 3, of three steps on either side of zero.
+    by_hand = bytes([3, 0b110_011_00, 0b1_011_100_0, 0b11_011_011])
+    assert pack_unit_encoding(u, 3) == by_hand
+    packed = client.post(READY, content=by_hand, headers=PACKED_UNIT)
+    assert packed.status_code == 200, packed.text
+    landmarks = np.load(io.BytesIO(client.get(MODEL).content))["prototypes"].astype(np.float64)
+    apart = (2 - 2 * landmarks @ u / np.linalg.norm(u)).tolist()
+    compared = client.post(READY, json={"dissimilarities": apart}).json()
+    assert packed.json()["retrieval"] == [
+        {**place, "relevance": pytest.approx(place["relevance"], abs=1e-5)} for place in compared["retrieval"]
+    ]
+    nothing = client.post(
+        READY, content=bytes([3]) + bytes([0b011_011_01, 0b1_011_011_0, 0b11_011_011]), headers=PACKED_UNIT
+    )
+    assert nothing.json()["informative"] is False
+
+
+@pytest.mark.parametrize("body", [b"\1", b"\3\0\0", b"\3\0\0\0\0", b"\3\xff\xff\xff", b"\x09" + bytes(9)])
+def test_bad_unit_encodings_are_refused(post, body):
+    problem(post(content=body, headers=PACKED_UNIT), 422, "invalid_encoding")
+    problem(post(content=b"", headers=PACKED_UNIT), 422, "empty_body")
+
+
 def test_a_robot_with_other_landmarks_is_told(post, client):
     digest = client.get("/v1/domains/ready").json()["landmark_model_digest"]
     for matching in (f'"{digest}"', "*", f'"other" , "{digest}"'):
@@ -153,27 +179,39 @@ def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_p
             path.write_bytes(encoded(picture(number)))
             ranked = encoder.ranks(path)
             assert len(ranked.body) <= 64
-            on_board, by_image = robot.localize("ranked", ranked=ranked), robot.localize("ranked", path)
+            on_board, by_image = robot.localize("ranked", on_board=ranked), robot.localize("ranked", path)
             assert (on_board.retrieval, on_board.belief) == (by_image.retrieval, by_image.belief)
-            assert here.observe(ranked=ranked).belief == there.observe(path).belief
-        assert (robot.relevances("ranked", ranked=ranked) == robot.relevances("ranked", path)).all()
+            assert here.observe(on_board=ranked).belief == there.observe(path).belief
+        assert (robot.relevances("ranked", on_board=ranked) == robot.relevances("ranked", path)).all()
         dark = encoded(np.zeros((90, 120, 3), np.uint8))
-        assert here.observe(ranked=encoder.ranks(dark)).belief == there.observe(dark).belief
+        assert here.observe(on_board=encoder.ranks(dark)).belief == there.observe(dark).belief
 
 
-def test_ranks_find_the_place_on_a_map_that_compares_encodings(client):
+def test_a_few_bytes_find_the_place_on_a_map_that_compares_encodings(client):
     robot = Client(str(client.base_url), transport=client._transport)
     encoder = robot.on_board("seen")
     for number in (5, 3):
-        ranked = encoder.ranks(encoded(picture(number)))
-        assert robot.localize("seen", ranked=ranked).retrieval[0].map_image == number
+        for seen in (encoder.view(encoded(picture(number))), encoder.ranks(encoded(picture(number)))):
+            assert robot.localize("seen", on_board=seen).retrieval[0].map_image == number
+            assert robot.localize_anywhere(on_board=seen, domains=["seen"]).domains[0].retrieval[0].map_image == number
+    with robot.session("seen") as session:
+        session.observe(on_board=encoder.view(encoded(picture(5))))
+        assert session.observe(on_board=encoder.view(encoded(picture(5))), action_m=0.0).belief.top[0].map_image == 5
+
+
+def test_a_map_that_compares_ranks_takes_no_unit_encoding(client):
+    client.make_ready_domain("by_ranks")
+    client.remap("by_ranks", landmark_traverse="drive", n_landmarks=N_LANDMARKS, relevance="rrf")
+    path = "/v1/domains/by_ranks/localizations"
+    about = problem(client.post(path, content=b"\3\0\0\0", headers=PACKED_UNIT), 422, "invalid_encoding")
+    assert "send ranked landmarks" in about["detail"]
 
 
 def test_the_client_names_other_landmarks(client):
     robot = Client(str(client.base_url), transport=client._transport)
     ranked = robot.on_board("ready").ranks(encoding=np.arange(8))
-    assert robot.localize("ready", ranked=ranked).map_version == 1
+    assert robot.localize("ready", on_board=ranked).map_version == 1
     with pytest.raises(LandmarkModelDiffersError, match="on_board") as caught:
-        robot.localize("ready", ranked=Observation(ranked.body, ranked.content_type, "other"))
+        robot.localize("ready", on_board=Observation(ranked.body, ranked.content_type, "other"))
     assert caught.value.problem["given_landmark_models"] == ["other"]
-    assert len(robot.relevances("ready", ranked=ranked)) == N_READY
+    assert len(robot.relevances("ready", on_board=ranked)) == N_READY

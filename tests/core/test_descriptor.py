@@ -11,11 +11,8 @@ from deepsimbad.core.descriptor import (
     n_ranked,
     nearest_landmarks,
     normal_scores,
-    pack_ranked_landmarks,
     rank_landmarks,
-    ranked_landmarks_within,
     ranks_from_ranked_landmarks,
-    unpack_ranked_landmarks,
 )
 from deepsimbad.errors import InvalidDissimilaritiesError, InvalidRankedLandmarksError
 
@@ -52,58 +49,6 @@ def test_how_many_landmarks_have_a_rank_of_their_own():
     assert [n_ranked(ranks_from_ranked_landmarks(order[:m], 6)) for m in range(1, 7)] == [1, 2, 3, 4, 6, 6]
     assert n_ranked(np.full(6, 3.5, np.float32)) == 0
     assert n_ranked(np.ones(1, np.float32)) == 1
-
-
-def slow_packed(ids, n_landmarks):
-    """By text: two bytes of m, then every id in as many digits as the largest needs."""
-    width = 0
-    while 2**width < n_landmarks:
-        width += 1
-    digits = f"{len(ids):016b}" + "".join(f"{one:0{width}b}" if width else "" for one in ids)
-    digits += "0" * (-len(digits) % 8)
-    return bytes(int(digits[place : place + 8], 2) for place in range(0, len(digits), 8))
-
-
-@given(st.data())
-def test_packed_ranks_are_what_their_definition_says(data):
-    n_landmarks = data.draw(st.one_of(st.integers(1, 70), st.sampled_from([256, 257, 500, 512, 65_535])))
-    ids = data.draw(st.lists(st.integers(0, n_landmarks - 1), min_size=1, max_size=min(n_landmarks, 80), unique=True))
-    body = pack_ranked_landmarks(ids, n_landmarks)
-    assert body == slow_packed(ids, n_landmarks)
-    assert unpack_ranked_landmarks(body, n_landmarks) == tuple(ids)
-
-
-@given(st.integers(1, 40), st.binary(max_size=30))
-def test_a_packed_body_is_read_as_what_would_pack_to_it_or_refused(n_landmarks, body):
-    try:
-        ids = unpack_ranked_landmarks(body, n_landmarks)
-    except InvalidRankedLandmarksError:
-        return
-    assert slow_packed(ids, n_landmarks) == body
-
-
-@pytest.mark.parametrize(
-    "body",
-    [b"", b"\0", b"\0\0", b"\0\x0b" + bytes(6), b"\0\2", b"\0\2\x12\0", b"\0\1\x11", b"\0\1\xa0", b"\0\2\x11"],
-    ids=["empty", "a byte", "m 0", "m 11 of 10", "too short", "too long", "padding", "id 10 of 10", "twice"],
-)
-def test_bad_packed_ranks_are_refused(body):
-    with pytest.raises(InvalidRankedLandmarksError):
-        unpack_ranked_landmarks(body, 10)
-
-
-def test_how_many_landmarks_64_bytes_hold():
-    assert [ranked_landmarks_within(64, r) for r in (1, 2, 40, 256, 300, 500, 512, 513)] == [
-        1,
-        2,
-        40,
-        62,
-        55,
-        55,
-        55,
-        49,
-    ]
-    assert len(pack_ranked_landmarks(range(55), 500)) == 64
 
 
 def test_normal_scores_are_the_quantiles_of_the_ranks():

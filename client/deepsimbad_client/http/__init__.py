@@ -133,7 +133,7 @@ class Observation:
 
     body: bytes
     content_type: str
-    landmark_model: str | None = None  # digest of the landmarks it was ranked by, which the answering map must have
+    landmark_model: str | None = None  # digest of what it was made by on board, which the answering map must have
 
     @property
     def headers(self) -> dict[str, str]:
@@ -151,7 +151,7 @@ class ViewForm(TypedDict, total=False):
     encoding: Numbers | None  # a ready encoding, where the domain takes them
     objects: Iterable[Mapping[str, Any]] | None  # {"label", "box", "score"} each, where the domain takes them
     text: str | None  # what is seen in words, where the domain takes them
-    ranked: Observation | None  # what an `OnBoardEncoder` made of an image, a few bytes
+    on_board: Observation | None  # what an `OnBoardEncoder` made of an image, a few bytes
 
 
 def media_type_of(body: bytes) -> str | None:
@@ -168,7 +168,7 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
         return observed(told, None if image is None else image_bytes(image))
     if len(forms) + (image is not None) != 1:
         raise InvalidArgumentError(
-            "give exactly one of image, ranked, ranked_landmarks, dissimilarities and encoding; or objects and text, "
+            "give exactly one of image, on_board, ranked_landmarks, dissimilarities and encoding; or objects and text, "
             "beside an image where the domain takes both"
         )
     if image is not None:

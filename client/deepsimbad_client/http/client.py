@@ -307,7 +307,7 @@ class ClientCalls(Face, Generic[AnySession]):
         `image` is an encoded one (JPEG, PNG, TIFF, WebP), its path or open file, sent as it is, or an array of pixels,
         [height, width, 3] BGR or [height, width] grey, sent as PNG; the other forms are those of
         `ViewForm`. `shortlist` is the length of `retrieval` and `belief.top`. Raises UnknownDomainError,
-        NoActiveMapError, LandmarkModelDiffersError (`ranked` was made with other landmarks than the map's),
+        NoActiveMapError, LandmarkModelDiffersError (`on_board` was made with other landmarks than the map's),
         InvalidInputError.
         """
         body = observation(image, **view)

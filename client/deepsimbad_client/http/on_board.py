@@ -1,8 +1,8 @@
-"""Encoding on board: a robot ranks a map's landmarks itself and sends a few bytes instead of an image.
+"""Encoding on board: a robot encodes by a map's landmark model itself and sends a few bytes instead of an image.
 
-The landmarks are fetched once, or read from a file that was kept. Images are decoded, encoded and compared by the very
-code that the service runs, so a view has the same ranks here as there. Needs `pip install 'deep-simbad[edge]'`, and
-says so where that is missing.
+The model is fetched once, or read from a file that was kept. Images are decoded, encoded and compared by the very
+code that the service runs, so a view has the same encoding and ranks here as there. Needs
+`pip install 'deep-simbad[edge]'`, and says so where that is missing.
 """
 
 from collections.abc import Iterator
@@ -29,20 +29,28 @@ try:
     import numpy as np
     from numpy.typing import NDArray
 
-    from deepsimbad.core.descriptor import pack_ranked_landmarks, rank_landmarks, ranked_landmarks_within
+    from deepsimbad.core.composed import is_composed
+    from deepsimbad.core.descriptor import rank_landmarks
     from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, unpack_landmarks
+    from deepsimbad.core.on_board import (
+        USUAL_BITS,
+        pack_ranked_landmarks,
+        pack_unit_encoding,
+        ranked_landmarks_within,
+    )
     from deepsimbad.errors import DeepSimbadError, InvalidImageError, InvalidInputError, MissingPackageError
     from deepsimbad.evaluators.base import Evaluator
     from deepsimbad.evaluators.compute import Compute
     from deepsimbad.evaluators.grey_levels import levels_in
     from deepsimbad.evaluators.image import decode_image, is_blank
     from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+    from deepsimbad.evaluators.space import compared_units
 except ImportError as missing:
     raise MissingExtraError(f"encoding on board needs further packages: {INSTALL}") from missing
 
-MEDIA_TYPE = "application/vnd.deepsimbad.ranks"
-DEFAULT_BODY_BYTES = 64
-"""What an observation takes unless told otherwise; what that costs in accuracy: docs/results/onboard.md."""
+RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
+RANKS_BYTES = 64
+"""What ranks take unless told otherwise; what that costs in accuracy: docs/results/onboard.md."""
 _MAX_PIXELS = 1 << 30  # the picture is the robot's own
 
 
@@ -109,29 +117,59 @@ class OnBoardEncoder:
             )
         return self._evaluator
 
+    def view(
+        self,
+        image: "Image | NDArray[np.uint8] | None" = None,
+        *,
+        encoding: Numbers | None = None,
+        n_bits: int = USUAL_BITS,
+    ) -> Observation:
+        """What `Client.localize` and `Session.observe` take as `on_board`; give exactly one form of the view.
+
+        Of a map that compares encodings (`composed`) the unit encoding travels, in `n_bits` a number, 2 to 8: 61 bytes
+        for 96 numbers by default, and no worse than all ranks. Of others the ranks that 64 bytes hold, as of `ranks`.
+
+        `image` is an encoded one, its path, or [height, width, 3] uint8 BGR. A picture that shows nothing travels as
+        JSON that says so. Raises InvalidArgumentError, BrokenFrameError, and as `load_extractor`.
+        """
+        if not is_composed(self.landmarks.model):
+            return self.ranks(image, encoding=encoding)
+        encodings = self._encoded(image, encoding)
+        if encodings is None:
+            return self._nothing()
+        with _named_arguments():
+            u, _ = compared_units(self._evaluator, encodings, self.landmarks.model)
+            return Observation(pack_unit_encoding(u[0], n_bits), UNIT_ENCODING, self.digest)
+
     def ranks(
         self, image: "Image | NDArray[np.uint8] | None" = None, *, encoding: Numbers | None = None, m: int | None = None
     ) -> Observation:
-        """What `Client.localize` and `Session.observe` take as `ranked`; give exactly one form of the view.
-
-        `image` is an encoded one, its path, or [height, width, 3] uint8 BGR; `m` of 1..r landmarks are sent, absent:
-        what 64 bytes hold. A picture that shows nothing travels as JSON that says so. Raises InvalidArgumentError,
-        BrokenFrameError, and as `load_extractor`.
-        """
-        n_sent = ranked_landmarks_within(DEFAULT_BODY_BYTES, self.n_landmarks) if m is None else m
+        """As `view`, by the m nearest of 1..r landmarks, the paper's descriptor; absent: as many as 64 bytes hold."""
+        n_sent = ranked_landmarks_within(RANKS_BYTES, self.n_landmarks) if m is None else m
         if not 1 <= n_sent <= self.n_landmarks:
             raise InvalidArgumentError(f"m is {n_sent}: send 1 to {self.n_landmarks} landmarks")
-        if (image is None) == (encoding is None):
-            raise InvalidArgumentError("give exactly one of image and encoding")
-        dissimilarities = self._of_image(image) if image is not None else self._of_encoding(encoding)
-        if dissimilarities is None:
-            return replace(observation(dissimilarities=[0] * self.n_landmarks), landmark_model=self.digest)
+        encodings = self._encoded(image, encoding)
+        if encodings is None:
+            return self._nothing()
+        with _named_arguments():
+            dissimilarities = self._evaluator.dissimilarities(encodings, self.landmarks.model)[0]
         nearest_first = np.argsort(rank_landmarks(dissimilarities))
         body = pack_ranked_landmarks(nearest_first[:n_sent].tolist(), self.n_landmarks)
-        return Observation(body, MEDIA_TYPE, self.digest)
+        return Observation(body, RANKS, self.digest)
+
+    def _nothing(self) -> Observation:
+        return replace(observation(dissimilarities=[0] * self.n_landmarks), landmark_model=self.digest)
+
+    def _encoded(
+        self, image: "Image | NDArray[np.uint8] | None", encoding: Numbers | None
+    ) -> NDArray[np.float32] | None:
+        """[1, d]; None for an image that shows nothing."""
+        if (image is None) == (encoding is None):
+            raise InvalidArgumentError("give exactly one of image and encoding")
+        return np.asarray(encoding, np.float32).reshape(1, -1) if image is None else self._of_image(image)
 
     def _of_image(self, image: "Image | NDArray[np.uint8]") -> NDArray[np.float32] | None:
-        """[r] dissimilarities; None for an image that shows nothing."""
+        """As `_encoded`."""
         if not self._evaluator.takes_images:
             raise InvalidArgumentError("the domain has no extractor and takes ready encodings alone: give encoding")
         if isinstance(image, np.ndarray):
@@ -148,16 +186,16 @@ class OnBoardEncoder:
             raise InvalidArgumentError(f"{what} is {list(pixels.shape)} {pixels.dtype}, not [height, width, 3] uint8")
         with _named_errors("the image cannot be encoded"):
             pixels = evaluator.prepare(pixels)
-            return None if is_blank(pixels) else self._compared(evaluator.encode([pixels]))
+            return None if is_blank(pixels) else evaluator.encode([pixels])
 
-    def _of_encoding(self, encoding: Numbers | None) -> NDArray[np.float32]:
-        try:
-            return self._compared(np.asarray(encoding, np.float32).reshape(1, -1))
-        except InvalidInputError as error:
-            raise InvalidArgumentError(error.message) from error
 
-    def _compared(self, encodings: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(self._evaluator.dissimilarities(encodings, self.landmarks.model)[0])
+@contextmanager
+def _named_arguments() -> Iterator[None]:
+    """Errors of what was given as this client names them."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise InvalidArgumentError(error.message) from error
 
 
 @contextmanager

@@ -40,6 +40,7 @@ from deepsimbad.engine.localizer import (
     Localization,
     NothingSeen,
     PackedRanks,
+    PackedUnitEncoding,
     RankedLandmarks,
     ReadyEncoding,
     View,
@@ -56,7 +57,7 @@ from deepsimbad.evaluators.image_files import MEDIA_TYPES
 PROBABLY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"], route_class=QuickRoute)
 
-RANKS = "application/vnd.deepsimbad.ranks"
+RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
 MAX_LANDMARKS = 0xFFFF
 
 # Bodies
@@ -99,14 +100,24 @@ _RANKS_SCHEMA: dict[str, Any] = {
     "description": "The same in fewest bytes: their number m in two, big-endian, then m landmark ids, nearest first, "
     "of ceil(log2 r) bits each, most significant bit first; zero bits fill the last byte.",
 }
-OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, RANKS, *TOLD_BODIES)
+_UNIT_ENCODING_SCHEMA: dict[str, Any] = {
+    **IMAGE_SCHEMA,
+    "description": "What a `composed` map compares, in few bytes: b, 2 to 8, in one, then k numbers of b bits each, "
+    "most significant bit first, code c standing for c - (2^(b-1) - 1); zero bits fill the last byte. They are brought "
+    "to unit length.",
+}
+MADE_ON_BOARD: dict[str, type[PackedRanks | PackedUnitEncoding]] = {
+    RANKS: PackedRanks,
+    UNIT_ENCODING: PackedUnitEncoding,
+}
+OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, *MADE_ON_BOARD, *TOLD_BODIES)
 
 
 def observation_body(beside: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The body of an observation in the OpenAPI document; members `beside` the view in a JSON body, by schema."""
     forms = [{**form, "properties": {**form["properties"], **(beside or {})}} for form in _FORMS]
-    content = {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, RANKS: _RANKS_SCHEMA, **TOLD_BODIES}
-    return declare(content)
+    packed = {RANKS: _RANKS_SCHEMA, UNIT_ENCODING: _UNIT_ENCODING_SCHEMA}
+    return declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, **packed, **TOLD_BODIES})
 
 
 OBSERVATION_BODY = observation_body()
@@ -372,8 +383,8 @@ async def view_in(
         if "encoding" in given:
             return ReadyEncoding(np.array(observation.encoding, np.float64)), []
         document = observation.model_dump(include=set(TOLD))
-    if media_type == RANKS:
-        return PackedRanks(body), []
+    if media_type in MADE_ON_BOARD:
+        return MADE_ON_BOARD[media_type](body), []
     levels = levels_in(snapshot.landmark_model)
     if media_type not in MEDIA_TYPES:
         scene, picture = await scene_in(

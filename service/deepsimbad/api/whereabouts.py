@@ -11,9 +11,9 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from deepsimbad.api.localizations import (
+    MADE_ON_BOARD,
     OBSERVATION_TYPES,
     PROBABLY,
-    RANKS,
     BeliefAnswer,
     NextBestViewAnswer,
     ObservationBody,
@@ -199,8 +199,9 @@ async def post_whereabouts(
 ) -> Response:
     """Localize one view on any of many domains, of which each is as probable as every other before it.
 
-    An image is encoded once for all domains of one evaluator whose maps are of one kind of picture. Ranked landmarks
-    and dissimilarities are of one landmark model: `If-Match` chooses the domains that have it, else all asked must.
+    An image is encoded once for all domains of one evaluator whose maps are of one kind of picture. Ranks,
+    dissimilarities and unit encodings are of one landmark model: `If-Match` chooses the domains that have it, else all
+    asked must.
     """
     watch = Stopwatch()
     media_type = media_type_of(request, OBSERVATION_TYPES)
@@ -214,7 +215,7 @@ async def post_whereabouts(
     if if_match is not None and (tags := insisted_on(if_match)) is not None:
         there, differing = await run_sync(_of_landmark_models, there, tags)
         left_out |= differing
-    elif media_type == RANKS or (
+    elif media_type in MADE_ON_BOARD or (
         observation and observation.model_fields_set & {"ranked_landmarks", "dissimilarities"}
     ):
         await run_sync(_check_one_landmark_model, there)
@@ -291,8 +292,8 @@ def _check_one_landmark_model(there: Sequence[MappedDomain]) -> None:
     digests = {mapped.snapshot.landmark_model_digest for mapped in there}
     if len(digests) > 1:
         raise LandmarkModelDiffersError(
-            f"ranks and dissimilarities are of one landmark model, and these domains have {len(digests)}: name its "
-            "digest in If-Match, and those that have it answer; or send the encoding",
+            f"what is made on board is of one landmark model, and these domains have {len(digests)}: name its digest "
+            "in If-Match, and those that have it answer; or send the encoding",
             landmark_model_digests=sorted(digests)[:_MOST_LISTED],
         )
 

@@ -65,7 +65,7 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
     Raises:
         InvalidRankedLandmarksError: None, too many, out of range or listed twice.
     """
-    ids = _checked(landmark_ids, n_landmarks)
+    ids = checked_ranking(landmark_ids, n_landmarks)
     n_sent = ids.size
     ranks = np.full(n_landmarks, (n_sent + 1 + n_landmarks) / 2, np.float32)
     ranks[ids] = np.arange(1, n_sent + 1, dtype=np.float32)
@@ -81,62 +81,11 @@ def n_ranked(ranks: NDArray[np.float32]) -> int:
     return ranks.size if last == ranks.size else round(2 * last) - 1 - ranks.size
 
 
-def pack_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> bytes:
-    """The nearest landmarks in the fewest bytes: m in two, big-endian, then m ids, nearest first.
-
-    An id takes ceil(log2 r) bits, most significant first; the last byte is filled up with zeros.
-
-    Raises:
-        InvalidRankedLandmarksError: None, too many, out of range or listed twice.
-    """
-    ids = _checked(landmark_ids, n_landmarks)
-    n_bits = _bits_per_id(n_landmarks)
-    bits = (ids[:, np.newaxis] >> np.arange(n_bits - 1, -1, -1)) & 1  # [m, bits]
-    return len(ids).to_bytes(2, "big") + np.packbits(bits.astype(np.uint8).reshape(-1)).tobytes()
-
-
-def unpack_ranked_landmarks(body: bytes, n_landmarks: int) -> tuple[int, ...]:
-    """Back from `pack_ranked_landmarks`.
-
-    Raises:
-        InvalidRankedLandmarksError: The body is not what packing 1..r distinct ids below r gives.
-    """
-    if len(body) < 2:
-        raise InvalidRankedLandmarksError("packed ranked landmarks begin with their number, in two bytes")
-    n_sent, n_bits = int.from_bytes(body[:2], "big"), _bits_per_id(n_landmarks)
-    if not 1 <= n_sent <= n_landmarks:
-        raise _wrong_number(n_sent, n_landmarks)
-    n_bytes = 2 + -(-n_sent * n_bits // 8)
-    if len(body) != n_bytes:
-        raise InvalidRankedLandmarksError(
-            f"{n_sent} ids of {n_bits} bits are packed into {n_bytes} bytes, not {len(body)}: "
-            "is it the landmark model of another map?",
-            n_landmarks=n_landmarks,
-            bits_per_id=n_bits,
-        )
-    bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=2))
-    if bits[n_sent * n_bits :].any():
-        raise InvalidRankedLandmarksError("the bits behind the last id must be zero")
-    places = np.left_shift(1, np.arange(n_bits - 1, -1, -1))
-    ids = bits[: n_sent * n_bits].reshape(n_sent, n_bits) @ places
-    return tuple(_checked(ids.tolist(), n_landmarks).tolist())
-
-
-def ranked_landmarks_within(n_bytes: int, n_landmarks: int) -> int:
-    """How many ranked landmarks, r at most, `pack_ranked_landmarks` brings into so many bytes."""
-    n_bits = _bits_per_id(n_landmarks)
-    return n_landmarks if n_bits == 0 else min(n_landmarks, 8 * (n_bytes - 2) // n_bits)
-
-
-def _bits_per_id(n_landmarks: int) -> int:
-    return (n_landmarks - 1).bit_length()
-
-
-def _checked(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.int64]:
-    """[m] ids that are a ranking's beginning; raises InvalidRankedLandmarksError."""
+def checked_ranking(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.int64]:
+    """[m] ids that a ranking may begin with; raises InvalidRankedLandmarksError."""
     n_sent = len(landmark_ids)
     if not 1 <= n_sent <= n_landmarks:
-        raise _wrong_number(n_sent, n_landmarks)
+        raise wrong_number(n_sent, n_landmarks)
     try:
         ids = np.asarray(landmark_ids, dtype=np.int64)
     except (OverflowError, TypeError, ValueError) as error:
@@ -150,7 +99,8 @@ def _checked(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.int64]
     return ids
 
 
-def _wrong_number(n_sent: int, n_landmarks: int) -> InvalidRankedLandmarksError:
+def wrong_number(n_sent: int, n_landmarks: int) -> InvalidRankedLandmarksError:
+    """None or more than there are."""
     return InvalidRankedLandmarksError(
         f"{n_sent} ranked landmarks sent; send 1 to {n_landmarks}, nearest first", n_landmarks=n_landmarks
     )

@@ -10,11 +10,13 @@ from deepsimbad.core.belief.evidence import ViewEvidence
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.summary import BeliefSummary, summarise
 from deepsimbad.core.building import MapPlan, compose_map
-from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks, unpack_ranked_landmarks
+from deepsimbad.core.composed import is_composed
+from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map
+from deepsimbad.core.on_board import unpack_ranked_landmarks, unpack_unit_encoding
 from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.engine.worker import EncodedImage, Stopwatch, encode_images
@@ -29,7 +31,7 @@ from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import is_blank
 from deepsimbad.evaluators.registry import EvaluatorKind
 from deepsimbad.evaluators.scenes import Scene
-from deepsimbad.evaluators.space import seen
+from deepsimbad.evaluators.space import seen, squared_between
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
@@ -52,7 +54,14 @@ class RankedLandmarks:
 
 @dataclass(frozen=True)
 class PackedRanks:
-    """Ranked landmarks as `core.descriptor.pack_ranked_landmarks` makes them; how many bits an id has the map tells."""
+    """Ranked landmarks as `core.on_board.pack_ranked_landmarks` makes them; how many bits an id has the map tells."""
+
+    body: bytes
+
+
+@dataclass(frozen=True)
+class PackedUnitEncoding:
+    """What `composed` compares, as `core.on_board.pack_unit_encoding` makes it; how many numbers the map tells."""
 
     body: bytes
 
@@ -77,7 +86,15 @@ class NothingSeen:
 
 
 View: TypeAlias = (
-    NothingSeen | Image | Scene | EncodedImage | ReadyEncoding | Dissimilarities | RankedLandmarks | PackedRanks
+    NothingSeen
+    | Image
+    | Scene
+    | EncodedImage
+    | ReadyEncoding
+    | Dissimilarities
+    | RankedLandmarks
+    | PackedRanks
+    | PackedUnitEncoding
 )
 """One observation: an image [height, width, 3] uint8 BGR, a scene told, or what was made of one here or on board."""
 
@@ -151,10 +168,12 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         WeightsDifferError: The map's images were encoded by other weights than the view.
     """
     n_landmarks = snapshot.n_landmarks
+    if isinstance(view, PackedRanks):
+        view = RankedLandmarks(unpack_ranked_landmarks(view.body, n_landmarks))
     if isinstance(view, RankedLandmarks):
         return Query(ranks_from_ranked_landmarks(view.landmark_ids, n_landmarks))
-    if isinstance(view, PackedRanks):
-        return Query(ranks_from_ranked_landmarks(unpack_ranked_landmarks(view.body, n_landmarks), n_landmarks))
+    if isinstance(view, PackedUnitEncoding):
+        view = _with_landmarks(snapshot, view)
     if isinstance(view, Dissimilarities):
         if view.values.shape != (n_landmarks,):
             raise InvalidDissimilaritiesError(
@@ -179,6 +198,18 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         encoding = ready_encodings(view.values[np.newaxis])[0]
     dissimilarities, compared = seen(evaluator, encoding[None, :], snapshot.landmark_model)
     return Query(rank_landmarks(dissimilarities[0]), dissimilarities[0], compared[0])
+
+
+def _with_landmarks(snapshot: Map, view: PackedUnitEncoding) -> Dissimilarities:
+    """What was standardised on board by the map's statistics, compared with the map's landmarks."""
+    model = snapshot.landmark_model
+    if not is_composed(model):
+        raise InvalidEncodingError(
+            f"map {snapshot.version} compares ranks ({snapshot.relevance}), not unit encodings: send ranked landmarks"
+        )
+    prototypes = np.asarray(model["prototypes"], np.float32)
+    u = unpack_unit_encoding(view.body, prototypes.shape[1])
+    return Dissimilarities(squared_between(u, prototypes).astype(np.float64))
 
 
 def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:

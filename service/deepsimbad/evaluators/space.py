@@ -39,8 +39,16 @@ def seen(
     """Dissimilarities [n, r] of scenes, and what stands for their encodings where the map compares them."""
     if not is_composed(model):
         return evaluator.dissimilarities(encodings, model), encodings
+    u, vectors = compared_units(evaluator, encodings, model)
+    return squared_between(u, np.asarray(model["prototypes"], np.float32)), vectors
+
+
+def compared_units(
+    evaluator: Evaluator, encodings: NDArray[np.float32], model: LandmarkModel
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """u [n, k] of scenes by what is usual on a composed map, and what stands for their encodings there."""
     vectors = evaluator.compared(encodings, model)
-    return between_units(vectors if vectors is encodings else as_usual(vectors, model), model), vectors
+    return unit_vectors(vectors if vectors is encodings else as_usual(vectors, model), model), vectors
 
 
 def as_usual(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
@@ -50,7 +58,12 @@ def as_usual(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.f
 
 def between_units(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
     """[n, r] squared distances between unit vectors of what is compared, [n, k], and a composed model's landmarks."""
-    usual, prototypes = (np.asarray(model[name], np.float32) for name in ("usual", "prototypes"))
+    return squared_between(unit_vectors(vectors, model), np.asarray(model["prototypes"], np.float32))
+
+
+def unit_vectors(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+    """[n, k] u of what is compared, by what is usual on the map; raises InvalidEncodingError."""
+    usual = np.asarray(model["usual"], np.float32)
     if vectors.ndim != 2 or vectors.shape[1] != usual.shape[1]:
         raise InvalidEncodingError(
             f"an encoding of {vectors.shape[-1]} numbers cannot be compared with landmarks of {usual.shape[1]}: they "
@@ -60,7 +73,11 @@ def between_units(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray
     moments = Moments.from_mean_std(usual)
     check_usable(vectors, moments)
     projection = np.asarray(model["projection"], np.float32) if "projection" in model else None
-    u = described(vectors, moments, projection)
+    return described(vectors, moments, projection)
+
+
+def squared_between(u: NDArray[np.float32], prototypes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[..., r] squared distances between unit vectors [..., k] and landmarks [r, k], by their products."""
     return np.asarray(np.clip(2 - 2 * (u @ prototypes.T), 0, 4), np.float32)
 
 

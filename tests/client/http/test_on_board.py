@@ -8,8 +8,9 @@ import httpx2
 import numpy as np
 import pytest
 
-from deepsimbad.core.descriptor import rank_landmarks, unpack_ranked_landmarks
+from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
+from deepsimbad.core.on_board import unpack_ranked_landmarks, unpack_unit_encoding
 from deepsimbad.errors import MissingPackageError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
@@ -20,7 +21,7 @@ from .scripted import Script, answer
 
 N_LANDMARKS = 300
 GRADIENTS = {"kind": "feature_l2", "extractor": "gradient_grid"}
-RANKS = "application/vnd.deepsimbad.ranks"
+RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
 
 
 def picture(seed):
@@ -56,6 +57,7 @@ def test_an_observation_is_64_bytes_of_the_nearest(content, model):
     seen = encoder.ranks(picture(1))
     assert seen.headers == {"Content-Type": RANKS, "If-Match": f'"{encoder.digest}"'}
     assert len(seen.body) == 64
+    assert encoder.view(picture(1)) == seen, "its map compares ranks"
     assert list(unpack_ranked_landmarks(seen.body, N_LANDMARKS)) == order[:55]
     for m in (1, 8, N_LANDMARKS):
         assert list(unpack_ranked_landmarks(encoder.ranks(picture(1), m=m).body, N_LANDMARKS)) == order[:m]
@@ -76,7 +78,7 @@ def test_an_image_may_be_bytes_a_path_or_an_array_and_a_saved_file_needs_no_netw
 
 
 def test_a_picture_of_nothing_says_so(content):
-    dark = OnBoardEncoder(content).ranks(np.zeros((60, 80, 3), np.uint8))
+    dark = OnBoardEncoder(content).view(np.zeros((60, 80, 3), np.uint8))
     assert dark.content_type == "application/json"
     assert dark.body == b'{"dissimilarities":[' + b",".join([b"0"] * N_LANDMARKS) + b"]}"
 
@@ -107,6 +109,14 @@ def test_landmarks_that_are_unit_vectors_are_ranked_by_what_is_usual_of_encoding
     likeness = prototypes @ ((encoding - usual[0]) / usual[1] @ projection)
     sent = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=40).body, 40)
     assert list(sent) == np.argsort(-likeness).tolist()
+    u = (encoding - usual[0]) / usual[1] @ projection
+    seen = encoder.view(encoding=encoding, n_bits=8)
+    assert seen.headers == {"Content-Type": UNIT_ENCODING, "If-Match": f'"{encoder.digest}"'}
+    assert unpack_unit_encoding(seen.body, 3) == pytest.approx(u / np.linalg.norm(u), abs=0.01)
+    assert len(encoder.view(encoding=encoding).body) == 1 + 2
+    for n_bits in (1, 9):
+        with pytest.raises(errors.InvalidArgumentError, match="2 to 8 bits"):
+            encoder.view(encoding=encoding, n_bits=n_bits)
     with pytest.raises(errors.InvalidArgumentError, match="another encoder"):
         encoder.ranks(encoding=[1.0, 2.0, 3.0])
     unfit = pack_landmarks(PortableLandmarks({**model, "usual": model["usual"][:, :5]}, 40, 1, {"kind": "feature_l2"}))
@@ -127,7 +137,7 @@ def test_arguments_that_cannot_be(content, tmp_path):
         with pytest.raises(errors.BrokenFrameError):
             encoder.ranks(broken)
     with pytest.raises(errors.InvalidArgumentError, match="exactly one"):
-        Client("http://service").localize("campus", picture(1), ranked=encoder.ranks(picture(1)))
+        Client("http://service").localize("campus", picture(1), on_board=encoder.ranks(picture(1)))
 
 
 def test_models_that_this_version_cannot_rank_by(model):
@@ -163,7 +173,7 @@ def test_it_is_fetched_for_a_map_and_sent_as_it_is(content):
         assert client.on_board("campus", map_version=3).digest == fetched.digest
         seen = fetched.ranks(picture(1))
         with pytest.raises(errors.LandmarkModelDiffersError, match="map_version=9"):
-            client.localize("campus", ranked=seen)
+            client.localize("campus", on_board=seen)
     base = "http://service/v1/domains/campus/landmark-model"
     assert [str(request.url) for request in script.requests[:2]] == [base, f"{base}?map_version=3"]
     sent = script.requests[2]

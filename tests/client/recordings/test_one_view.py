@@ -95,8 +95,8 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
         bodies = [(looks / path).read_bytes() for path in paths]
         at, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/jpeg"}
         by_curl = [httpx2.post(at, content=body, headers=header).json() for body in bodies]
-        on_board = client.on_board("yard")
-        by_ranks = [client.localize("yard", ranked=on_board.ranks(path, m=8)) for path in paths]
+        eyes = client.on_board("yard")
+        by_ranks = [client.localize("yard", on_board=eyes.ranks(path, m=8)) for path in paths]
         capsys.readouterr()
         assert run(["localize", "yard", *paths, "--server", url, "--json"]) == 0
         assert run(["localize", "yard", "--server", url]) == 2
@@ -200,8 +200,8 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, caps
         assert job.result["metrics"]["n_uninformative"] == 1
         assert client.domain("yard").grey_levels == levels
         by_curl = httpx2.post(f"{url}/v1/domains/yard/localizations", content=image, headers=header).json()
-        on_board = client.on_board("yard")
-        assert on_board.ranks(look, m=8) == on_board.ranks(decode_image(image, LIMIT, levels=levels), m=8)
+        eyes = client.on_board("yard")
+        assert eyes.ranks(look, m=8) == eyes.ranks(decode_image(image, LIMIT, levels=levels), m=8)
         with client.session("yard") as session:
             in_session = session.observe(image=image)
             bright = session.observe(image=cv2.imencode(".png", deep(105) + np.uint16(200))[1].tobytes())
