@@ -33,6 +33,8 @@ try:
     from deepsimbad.core.descriptor import rank_landmarks
     from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, unpack_landmarks
     from deepsimbad.core.on_board import (
+        RANKS,
+        UNIT_ENCODING,
         USUAL_BITS,
         pack_ranked_landmarks,
         pack_unit_encoding,
@@ -48,7 +50,6 @@ try:
 except ImportError as missing:
     raise MissingExtraError(f"encoding on board needs further packages: {INSTALL}") from missing
 
-RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
 RANKS_BYTES = 64
 """What ranks take unless told otherwise; what that costs in accuracy: docs/results/onboard.md."""
 _MAX_PIXELS = 1 << 30  # the picture is the robot's own

@@ -34,6 +34,7 @@ from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, sc
 from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
+from deepsimbad.core.on_board import RANKS, UNIT_ENCODING
 from deepsimbad.core.planners import Plan
 from deepsimbad.engine.localizer import (
     Dissimilarities,
@@ -57,7 +58,6 @@ from deepsimbad.evaluators.image_files import MEDIA_TYPES
 PROBABLY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"], route_class=QuickRoute)
 
-RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
 MAX_LANDMARKS = 0xFFFF
 
 # Bodies

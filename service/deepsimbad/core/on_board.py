@@ -14,6 +14,9 @@ from deepsimbad.core.composed import unit
 from deepsimbad.core.descriptor import checked_ranking, wrong_number
 from deepsimbad.errors import InvalidEncodingError, InvalidRankedLandmarksError
 
+RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
+"""Media types."""
+
 USUAL_BITS = 5  # a number: what more of them gain is lost among the seasons
 _LEAST_BITS, _MOST_BITS = 2, 8
 

@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.on_board import RANKS, UNIT_ENCODING
 from deepsimbad.errors import InvalidSceneError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import decode_image, is_blank
@@ -33,7 +34,7 @@ class Form(StrEnum):
     TEXT = "text"
 
 
-_OTHERS = ("application/json", "application/vnd.deepsimbad.ranks")  # that every domain takes
+_OTHERS = ("application/json", RANKS, UNIT_ENCODING)  # that every domain takes
 
 
 @dataclass(frozen=True)
