@@ -7,6 +7,7 @@ Images are `sensor_msgs/Image` or `CompressedImage`. Positions are the first the
 and are not kept. Times are those of the headers, or of the recording where headers have none.
 """
 
+import dataclasses
 import math
 import threading
 import weakref
@@ -318,7 +319,8 @@ def _placed(images: list[tuple[str, int]], rows: _Rows, kind: str, where: str) -
         raise SourceError(f"{where}: fewer than two positions can be used")
     result = placed_on(track, images, where)
     if kind == _ODOMETRY:
-        result.without_plane()
+        # x, y and heading are of this drive's own beginning and no other's
+        result.frames = [dataclasses.replace(frame, x_m=None, y_m=None, heading_rad=None) for frame in result.frames]
     return result
 
 

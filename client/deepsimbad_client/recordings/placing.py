@@ -53,10 +53,6 @@ class Placed:
         self.left_out_names |= later.left_out_names
         self.remarks += later.remarks
 
-    def without_plane(self) -> None:
-        """Forget x, y and heading, where they are of this drive's own beginning and no other's."""
-        self.frames = [dataclasses.replace(frame, x_m=None, y_m=None, heading_rad=None) for frame in self.frames]
-
     def number(self) -> None:
         """Count the frames' indices from 0."""
         self.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(self.frames)]

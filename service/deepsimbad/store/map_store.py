@@ -11,8 +11,11 @@ its beginning. Nothing is ever removed.
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 from uuid import uuid4
@@ -20,11 +23,13 @@ from uuid import uuid4
 from deepsimbad.errors import DamagedFileError, DamagedMapError, UnavailableError
 from deepsimbad.store.backup import Finding
 from deepsimbad.store.durable import verify
+from deepsimbad.store.map_file import fetch
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.records import to_json
 
 _STATE = "state.json.gz"
 _MOST_AT_ONCE = 32  # entries that are asked for together
+_N_LOCKS = 16  # of two files that are asked for seldom the same
 
 
 class MapStore:
@@ -130,6 +135,65 @@ class MapStore:
                 findings.append(Finding(f"{self.url}/{_map_name(sha256)}", what))
             on_progress(n_read / len(digests))
         return findings
+
+
+class MapCache:
+    """Files of a store's maps that lie here too, at most so many bytes of them; those asked for longest ago go first.
+
+    `files` lists them, those that are not the store's among them, and `may_go` tells of one whether it can be fetched
+    again and is not in use. Of `most_bytes` None is any number. Usable from any thread.
+    """
+
+    def __init__(
+        self,
+        store: MapStore,
+        files: Callable[[], Iterable[Path]],
+        may_go: Callable[[Path], bool],
+        most_bytes: int | None,
+    ) -> None:
+        self._store, self._files, self._may_go, self._most_bytes = store, files, may_go, most_bytes
+        self._asking = tuple(threading.Lock() for _ in range(_N_LOCKS))
+        self._making_room, self._n_coming = threading.Lock(), 0
+
+    @contextmanager
+    def asked_for(self, path: Path) -> Iterator[None]:
+        """Whoever else asks for a file waits meanwhile, so that it is fetched once."""
+        with self._asking[hash(path) % _N_LOCKS]:
+            yield
+            with suppress(OSError):  # a disk that may only be read
+                os.utime(path)
+
+    def fetch(self, path: Path, sha256: str, n_bytes: int) -> None:
+        """Bring a map here; raises DamagedMapError, and UnavailableError too where there is no room."""
+        with self._making_room:
+            if self._most_bytes is not None:
+                self._make_room(self._n_coming + n_bytes, self._most_bytes)
+            self._n_coming += n_bytes  # until they are a file there
+        try:
+            fetch(self._store.map_pieces(sha256), path, sha256)
+        finally:
+            with self._making_room:
+                self._n_coming -= n_bytes
+
+    def _make_room(self, n_bytes: int, most_bytes: int) -> None:
+        files = []
+        for path in self._files():
+            with suppress(FileNotFoundError):
+                files.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+        excess = sum(size for _, size, _ in files) + n_bytes - most_bytes
+        for _, size, path in sorted(files):
+            if excess <= 0:
+                return
+            if self._may_go(path):
+                path.unlink(missing_ok=True)
+                excess -= size
+        if excess > 0:
+            raise UnavailableError(
+                f"{n_bytes} bytes of maps have no room beside the files that are in use: raise map_cache_disk_bytes, "
+                f"which is {most_bytes}",
+                reason="cache_full",
+                map_cache_disk_bytes=most_bytes,
+            )
 
 
 def _map_name(sha256: str) -> str:

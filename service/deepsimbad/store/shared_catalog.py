@@ -19,7 +19,6 @@ from deepsimbad.errors import (
     DomainDiffersError,
     LostActivationError,
     NotFoundError,
-    UnavailableError,
 )
 from deepsimbad.store import layout
 from deepsimbad.store.backup import Inspection
@@ -27,15 +26,13 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY, AnyVersion
 from deepsimbad.store.connection import look_at, open_database
 from deepsimbad.store.durable import empty_graves, storage_faults, sync
-from deepsimbad.store.map_file import fetch
-from deepsimbad.store.map_store import MapStore
+from deepsimbad.store.map_store import MapCache, MapStore
 from deepsimbad.store.records import DomainRecord, MapRecord, MapState, from_json, now, read_domains, to_json
 
 T = TypeVar("T")
 _State: TypeAlias = dict[str, Any] | None
 _LEAST_BETWEEN_STATES = 256  # entries of the log; of many domains an eighth of their number
 _ADMINISTRATOR = "administrator"  # among a domain's options
-_N_LOCKS = 16  # of fetching: of two files seldom the same
 
 
 def open_catalog(
@@ -101,6 +98,7 @@ class SharedCatalog(Catalog):
     """
 
     store: MapStore
+    _cache: MapCache
     is_in_use: Callable[[str, int, str], bool] = staticmethod(lambda _domain, _version, _sha256: False)
     """Whether a map, by its domain, version and digest, is in memory or pinned, and keeps its file."""
     administrator: int = 0
@@ -108,18 +106,16 @@ class SharedCatalog(Catalog):
 
     def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(data_dir, db)
-        self._cache_bytes: int | None = None
         self.following = threading.Lock()  # held by who follows and does what follows from it
         self._transaction: Database | None = None
         self._is_trying = False
-        self._fetching = tuple(threading.Lock() for _ in range(_N_LOCKS))
-        self._making_room, self._n_coming = threading.Lock(), 0
 
     def begin_to_follow(
         self, store: MapStore, cache_bytes: int | None, administrator: int | None, *, is_new: bool
     ) -> None:
         """Take up a store; raises as `open_catalog`."""
-        self.store, self._cache_bytes = store, cache_bytes
+        files = partial(layout.domains_folder(self.data_dir).glob, "*/maps/*.sqlite")
+        self.store, self._cache = store, MapCache(store, files, self._may_go, cache_bytes)
         if is_new:
             self._note_store(store)
         with self._reading() as db:
@@ -409,16 +405,13 @@ class SharedCatalog(Catalog):
     def map_file(self, domain: str, version: int) -> Path:
         """As `Catalog.map_file`; a shared map that is missing or damaged here is fetched, once however many ask."""
         record, path = self.map(domain, version), self.map_path(domain, version)
-        with self._fetching[hash(path) % _N_LOCKS]:
+        with self._cache.asked_for(path):
             try:
                 super().map_file(domain, version)
             except DamagedMapError:
                 if record.sha256 is None or not self._is_shared(domain, version):
                     raise
-                with self._room_for(record.file_bytes or 0):
-                    fetch(self.store.map_pieces(record.sha256), path, record.sha256)
-            with suppress(OSError):  # a disk that may only be read
-                os.utime(path)  # files that were asked for longest ago make room first
+                self._cache.fetch(path, record.sha256, record.file_bytes or 0)
         return path
 
     def has_file(self, domain: str, version: int) -> bool:
@@ -433,42 +426,12 @@ class SharedCatalog(Catalog):
             )
             return rows.fetchone() is not None
 
-    @contextmanager
-    def _room_for(self, n_bytes: int) -> Iterator[None]:
-        """So many bytes of the cache, until they are a file there; raises UnavailableError."""
-        with self._making_room:
-            if self._cache_bytes is not None:
-                self._make_room(self._n_coming + n_bytes, self._cache_bytes)
-            self._n_coming += n_bytes
-        try:
-            yield
-        finally:
-            with self._making_room:
-                self._n_coming -= n_bytes
-
-    def _make_room(self, n_bytes: int, cache_bytes: int) -> None:
-        """Remove files that can be fetched again, those asked for longest ago first, until so many bytes fit in."""
-        files = []
-        for path in layout.domains_folder(self.data_dir).glob("*/maps/*.sqlite"):
-            with suppress(FileNotFoundError):
-                files.append((path.stat().st_mtime_ns, path.stat().st_size, path))
-        excess = sum(size for _, size, _ in files) + n_bytes - cache_bytes
-        for _, size, path in sorted(files):
-            if excess <= 0:
-                return
-            domain, version = path.parent.parent.name, int(path.stem)
-            if self._is_shared(domain, version):
-                digest = self.map(domain, version).sha256 or ""
-                if not self.is_in_use(domain, version, digest):
-                    path.unlink(missing_ok=True)
-                    excess -= size
-        if excess > 0:
-            raise UnavailableError(
-                f"{n_bytes} bytes of maps have no room beside the files that are in use: raise map_cache_disk_bytes, "
-                f"which is {cache_bytes}",
-                reason="cache_full",
-                map_cache_disk_bytes=cache_bytes,
-            )
+    def _may_go(self, path: Path) -> bool:
+        """Whether a map's file can be fetched again and is not in use."""
+        domain, version = path.parent.parent.name, int(path.stem)
+        if not self._is_shared(domain, version):
+            return False
+        return not self.is_in_use(domain, version, self.map(domain, version).sha256 or "")
 
 
 class _UndoneError(Exception):
