@@ -231,8 +231,7 @@ class _Triplet:
     """Three recordings, read."""
 
     evaluator: Evaluator
-    landmarks: EncodedRecording
-    training: EncodedRecording
+    drives: tuple[Drive, Drive, Drive]  # landmarks, training, test
     test: EncodedRecording
     n_landmarks: int  # as many as are asked for, or fit
     tolerance_m: float  # that papers on this set have, or ours
@@ -252,26 +251,22 @@ class _Triplet:
         for stage, recording in zip(_READING_STAGES, opened, strict=True):
             progress.stage(stage)
             recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
-        landmarks, training, test = recordings
+        landmarks, training, test = (recording.drive for recording in recordings)
         sources = {
             **{role: asked[role] for role in _ROLES},
             "evaluator": config.as_dict(),
             "spacing_m": asked["spacing_m"],
             "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
         }
-        n_landmarks = fitting_number(asked["n_landmarks"], landmarks.drive.n_frames, _N_LANDMARKS)
-        warnings = known_drives(test.drive, landmarks=landmarks.drive, training=training.drive)
+        n_landmarks = fitting_number(asked["n_landmarks"], landmarks.n_frames, _N_LANDMARKS)
+        warnings = known_drives(test, landmarks=landmarks, training=training)
         for role, recording, encoded in zip(_ROLES, opened, recordings, strict=True):
             warnings += [f"{role}: {remark}" for remark in recording.remarks]
             warnings += [f"{role}: {line}" for line in left_out_lines(encoded.left_out_names, verbose=False)]
         pictures = RecordingPictures(opened[0], settings.max_pixels)
         tolerance_m = usual_tolerance_m(*opened)
-        return cls(evaluator, landmarks, training, test, n_landmarks, tolerance_m, sources, warnings, pictures)
-
-    @property
-    def drives(self) -> tuple[Drive, Drive, Drive]:
-        """Landmarks, training, test."""
-        return self.landmarks.drive, self.training.drive, self.test.drive
+        drives = landmarks, training, test
+        return cls(evaluator, drives, recordings[2], n_landmarks, tolerance_m, sources, warnings, pictures)
 
 
 def usual_tolerance_m(*recordings: Recording) -> float:

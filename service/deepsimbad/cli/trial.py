@@ -25,7 +25,7 @@ from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments.kept import kept_encodings
-from deepsimbad.jobs.experiments.trial import RECALL_RANKS, TRIAL_STAGES, Stretch, TrialConfig, TrialReport, run_trial
+from deepsimbad.jobs.experiments.trial import RECALL_RANKS, TRIAL_STAGES, Stretch, TrialReport, run_trial
 from deepsimbad.jobs.experiments.truth import known_drives
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad.jobs.fitting import RecordingPictures
@@ -104,12 +104,14 @@ def try_(
                 )
         drives = {role: each.drive for role, each in encoded.items()}
         truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)
-        config = TrialConfig(tolerance_m, same_route=True if ground_truth is None else None)
+        same_route = True if ground_truth is None else None
         ordered = (drives.get("landmarks"), drives["database"], drives["queries"])
         pictures = RecordingPictures(recordings["landmarks" if landmarks else "database"], settings.max_pixels)
-        report = run_trial(config, measure, *ordered, truth, progress, pictures)
+        report = run_trial(measure, *ordered, truth, same_route, progress, pictures)
         document = report.as_dict(
             {
+                "tolerance_m": tolerance_m,
+                "same_route": same_route,
                 **sources,
                 "landmarks": landmarks,
                 "ground_truth": None if ground_truth is None else str(ground_truth),

@@ -33,15 +33,6 @@ _N_STRETCHES = 20  # that a drive is cut into, to say where it fails
 
 
 @dataclass(frozen=True)
-class TrialConfig:
-    """What a trial is of, beside the two drives; the rest is as a remap has it by default."""
-
-    tolerance_m: float = 2.0  # how far from the query a map image may be and still be true
-    # Whether positions of the landmark drive and the database are comparable; None: where both know x, y
-    same_route: bool | None = True
-
-
-@dataclass(frozen=True)
 class Outcome:
     """One query, and what came back."""
 
@@ -72,7 +63,6 @@ class Stretch:
 class TrialReport:
     """What a trial came to."""
 
-    config: TrialConfig
     map: Map
     queries: Drive
     outcomes: list[Outcome]  # in the order of the queries
@@ -87,7 +77,7 @@ class TrialReport:
         """Those where some query fails, worst first."""
         return _stretches(self.queries, self.outcomes)
 
-    def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
+    def as_dict(self, config: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document, as `experiment vpr` has it."""
         errors = [outcome.error_m for outcome in self.outcomes if outcome.error_m is not None]
         by_belief = [outcome.belief_error_m for outcome in self.outcomes if outcome.belief_error_m is not None]
@@ -102,18 +92,18 @@ class TrialReport:
             "n_forgot": self.n_forgot,
             "fails": [asdict(stretch) for stretch in self.stretches],
             "index_bits_per_map_image": bits_per_map_image(self.map),
-            "config": {**asdict(self.config), **sources},
+            "config": config,
             "seconds": self.seconds,
         }
 
 
 def run_trial(
-    config: TrialConfig,
     evaluator: Evaluator,
     landmarks: Drive | None,
     database: Drive,
     queries: Drive,
     true_images: Sequence[NDArray[np.int64]],
+    same_route: bool | None,
     progress: Progress,
     pictures: Pictures | None = None,
 ) -> TrialReport:
@@ -122,10 +112,11 @@ def run_trial(
     Args:
         landmarks: Another drive to choose landmarks from and learn from; None: the database's own frames.
         true_images: For every query the map images that count as true.
+        same_route: Whether positions of the landmark drive and the database are comparable; None: where both know x, y.
         pictures: Of the drive that landmarks are chosen from, for evaluators that are fitted to images.
     """
     progress.stage("map")
-    plan = MapPlan(DEFAULT_RELEVANCE, DEFAULT_LIST_LENGTH, (CONFIDENT_WITHIN_M,), same_route=config.same_route)
+    plan = MapPlan(DEFAULT_RELEVANCE, DEFAULT_LIST_LENGTH, (CONFIDENT_WITHIN_M,), same_route=same_route)
     n_landmarks = fitting_number(None, (landmarks or database).n_frames, DEFAULT_N_LANDMARKS)
     fitter = Fitter(evaluator, pictures)
     built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
@@ -144,7 +135,7 @@ def run_trial(
         progress.update((row + 1) / len(true_images))
     scores = {DEFAULT_RELEVANCE.value: scorer.result(), BRUTE_FORCE_U: by_all.result()}
     return TrialReport(
-        *(config, built.map, queries, outcomes, np.array(beliefs, np.float32), scores),
+        *(built.map, queries, outcomes, np.array(beliefs, np.float32), scores),
         {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
         n_forgot,
         built.warnings,
