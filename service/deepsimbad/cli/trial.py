@@ -6,7 +6,6 @@ The page is one HTML file with everything in it, for any screen and both colour 
 import re
 from base64 import b64encode
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -162,15 +161,6 @@ _MOST_STRETCHES = 5
 _TRUTH_AT = 0.02  # of the route to either side, where the lines beside the truth run
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A small copy of a frame."""
-
-    uri: str
-    width: int
-    height: int
-
-
 class Album:
     """Names and small pictures of a drive's frames.
 
@@ -191,7 +181,8 @@ class Album:
         """One frame: its name, and its picture or None."""
         return {"name": self._frames[row].name, "picture": self._picture(row) if self.has_pictures else None}
 
-    def _picture(self, row: int) -> Picture | None:
+    def _picture(self, row: int) -> dict[str, Any] | None:
+        """A small copy of a frame: `uri`, `width` and `height`."""
         try:
             read = self._recording.image(self._frames[row], (_LONGEST_PX, _LONGEST_PX)).body
             image = decode_image(read, self._max_pixels)
@@ -203,7 +194,7 @@ class Album:
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         body = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
         self.n_bytes += len(body)
-        return Picture(f"data:image/jpeg;base64,{b64encode(body).decode()}", width, height)
+        return {"uri": f"data:image/jpeg;base64,{b64encode(body).decode()}", "width": width, "height": height}
 
 
 def write_page(
