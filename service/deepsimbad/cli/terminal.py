@@ -200,11 +200,7 @@ def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -
 
 
 def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
-    """A table on standard output, whole where that is no terminal, and remarks in lines below it.
-
-    Args:
-        numbers: Whether all columns but the first hold numbers.
-    """
+    """A table on standard output, whole where that is no terminal, and remarks below; all but names may be numbers."""
     for column in table.columns[1:] if numbers else ():
         column.justify = "right"
     console = Console(width=None if sys.stdout.isatty() else 160)

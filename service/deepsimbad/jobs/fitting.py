@@ -68,11 +68,7 @@ class RecordingPictures:
 
 
 class SpooledPictures:
-    """Those that wait with a traverse, where views of them are kept too.
-
-    Args:
-        elsewhere: Where a picture is that does not wait; None: nowhere.
-    """
+    """Those that wait with a traverse, where views of them are kept too; `elsewhere` has those that do not wait."""
 
     def __init__(self, traverse: Traverse, drive: Drive, elsewhere: Pictures | None = None) -> None:
         self._traverse, self._levels, self._dim = traverse, drive.grey_levels, drive.encoding_dim
@@ -115,8 +111,7 @@ class Fitter:
     ) -> tuple[NDArray[np.int64], Fitted]:
         """Choose r of the candidates, and fit the evaluator to them; see `select_landmarks` and `Evaluator.fit`.
 
-        Args:
-            other: Another drive, perhaps of the same route.
+        The other drive is perhaps of the same route.
         """
         fitting, asked = self._evaluator.fitting, (candidates, n_landmarks, other)
         if self._last is not None and all(

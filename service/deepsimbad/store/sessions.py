@@ -181,11 +181,7 @@ class SessionStore(OpenFile):
             return [_session(row) for row in rows]
 
     def holders(self, *, may_have_ended: bool = False) -> list[str | None]:  # noqa: ARG002 - for who shares
-        """The API key (None: none) of every session that has not ended.
-
-        Args:
-            may_have_ended: Whether others may be among them, where that is told sooner.
-        """
+        """The API key (None: none) of every session that has not ended, perhaps of others where that is told sooner."""
         with self._reading() as db:
             return [key_id for (key_id,) in db.execute("SELECT key_id FROM session WHERE ended_at IS NULL")]
 

@@ -118,11 +118,7 @@ def _mean_of(documents: Sequence[Any]) -> Any:
 def _judged(
     claim: str, pooled: Pooled, name: str, rival: str, agree: Sequence[bool], seed: int, said_by: str = "paper"
 ) -> Document:
-    """A claim that one method's figure is less than another's.
-
-    Args:
-        agree: For every triplet whether it is so there.
-    """
+    """A claim that one method's figure is less than another's; whether it is so in every triplet."""
     difference = pooled.difference(name, rival, seed)
     ends = [difference["stretches"], difference["drives"]]
     verdict = HOLDS if all(high < 0 for _, high in ends) else UNDECIDED
