@@ -5,9 +5,9 @@ import fcntl
 import os
 import shutil
 import tempfile
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AsyncExitStack, aclosing, suppress
+from contextlib import AsyncExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, TypeAlias, cast
 import anyio
 from ray import serve
 from ray.serve.handle import DeploymentHandle
-from starlette.types import ASGIApp, Message, Scope
+from starlette.types import Message, Scope
 
 from deepsimbad.api.app import Elsewhere, create_app, follow
 from deepsimbad.api.localizations import render_localization
@@ -249,34 +249,27 @@ class Replica:
         """A short answer whole."""
         return [message async for message in self.stream(scope, body)]
 
-    async def stream(self, scope: Scope, body: bytes) -> AsyncIterator[Message]:
-        """An answer as the application sends it."""
-        async with aclosing(_asked(self._app, scope, body)) as messages:
+    async def stream(self, scope: Scope, body: bytes) -> AsyncGenerator[Message]:
+        """An answer as the application sends it, which is asked without a socket."""
+        parts = [{"type": "http.request", "body": body, "more_body": False}]
+        send, messages = anyio.create_memory_object_stream[Message](_MESSAGES)
+
+        async def receive() -> Message:
+            if not parts:
+                await asyncio.Event().wait()  # nobody leaves; who does is heard of by cancelling
+            return parts.pop()
+
+        async def answer() -> None:
+            async with send:
+                await self._app(scope, receive, send.send)
+
+        answering = asyncio.create_task(answer())
+        try:
             async for message in messages:
                 yield message
-
-
-async def _asked(app: ASGIApp, scope: Scope, body: bytes) -> AsyncGenerator[Message]:
-    """The messages of an application's answer to a request with this body, as ASGI sends them without a socket."""
-    parts = [{"type": "http.request", "body": body, "more_body": False}]
-    send, messages = anyio.create_memory_object_stream[Message](_MESSAGES)
-
-    async def receive() -> Message:
-        if not parts:
-            await asyncio.Event().wait()  # nobody leaves; who does is heard of by cancelling
-        return parts.pop()
-
-    async def answer() -> None:
-        async with send:
-            await app(scope, receive, send.send)
-
-    answering = asyncio.create_task(answer())
-    try:
-        async for message in messages:
-            yield message
-    finally:
-        messages.close()
-        answering.cancel()
+        finally:
+            messages.close()
+            answering.cancel()
 
 
 def _new_folder() -> Path:
