@@ -99,12 +99,12 @@ def test_a_picture_is_small_and_of_the_frames_shape(tmp_path, size):
     album = Album(open_source(str(tmp_path)), drive, 10**6)
     picture = album.shown(0)["picture"]
     shrunk = max(1.0, max(size) / 200)
-    assert (picture.width, picture.height) == (round(size[0] / shrunk), round(size[1] / shrunk))
-    body = b64decode(picture.uri.partition("base64,")[2])
+    assert (picture["width"], picture["height"]) == (round(size[0] / shrunk), round(size[1] / shrunk))
+    body = b64decode(picture["uri"].partition("base64,")[2])
     shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
-    assert shown.shape[:2] == (picture.height, picture.width)
-    assert (shown[:, : picture.width // 3] < 60).all()
-    assert (shown[:, -picture.width // 3 :] > 200).all()
+    assert shown.shape[:2] == (picture["height"], picture["width"])
+    assert (shown[:, : picture["width"] // 3] < 60).all()
+    assert (shown[:, -picture["width"] // 3 :] > 200).all()
     assert album.n_bytes == len(body)
 
 
