@@ -29,7 +29,8 @@ DOMAIN = "nordland"
 RELEVANCES = ("composed", "standardised", "rrf", "bag_of_landmarks", "simbad", "brute_force")
 TOLERANCE_M = 2.0
 REMAP: dict[str, Any] = {"landmark_traverse": "landmarks", "n_landmarks": 300, "list_length": 4}
-MAP_FRAMES, LANDMARK_FRAMES = range(1000), range(1000, 2000)
+N_FRAMES = 1000
+MAP_FRAMES, LANDMARK_FRAMES = range(N_FRAMES), range(N_FRAMES, 2 * N_FRAMES)
 _LEAST_GREY_STD = 8.0
 
 
@@ -67,27 +68,33 @@ def season_folder(folder: Path, season: Path, numbers: list[int], first: int) ->
     return folder
 
 
-def drive_folders(nordland: Path, work: Path) -> tuple[dict[str, Path], int, int]:
-    """Folders `landmarks`, `map` and `live`, and how many frames of map and landmarks were left out."""
+def drive_folders(nordland: Path, work: Path, n_frames: int = N_FRAMES) -> tuple[dict[str, Path], int, int]:
+    """Folders `landmarks`, `map` and `live`, and how many frames of map and landmarks were left out.
+
+    Args:
+        n_frames: How many of the frames of map and landmarks to take, from the first on.
+    """
     summer, winter = nordland / "summer", nordland / "winter"
-    kept, candidates = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
+    kept = kept_frames((summer, winter), MAP_FRAMES[:n_frames])
+    candidates = kept_frames((summer,), LANDMARK_FRAMES[:n_frames])
     drives = {
         "landmarks": season_folder(work / "landmarks", summer, candidates, LANDMARK_FRAMES.start),
         "map": season_folder(work / "map", summer, kept, MAP_FRAMES.start),
         "live": season_folder(work / "live", winter, kept, MAP_FRAMES.start),
     }
-    return drives, len(MAP_FRAMES) - len(kept), len(LANDMARK_FRAMES) - len(candidates)
+    return drives, n_frames - len(kept), n_frames - len(candidates)
 
 
-def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES) -> Measured:
+def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES, n_frames: int = N_FRAMES) -> Measured:
     """Upload, remap and replay against a service of our own.
 
     Args:
         nordland: The folder that holds `summer` and `winter`.
         work: An empty folder.
         relevances: The maps to make, one after the other.
+        n_frames: As in `drive_folders`.
     """
-    drives, n_map_left_out, n_landmarks_left_out = drive_folders(nordland, work)
+    drives, n_map_left_out, n_landmarks_left_out = drive_folders(nordland, work, n_frames)
     live, summaries = open_source(str(drives["live"])), {}
     with LocalServer(work / "data") as server, Client(server.url) as client:
         make_domain(client, drives)

@@ -70,4 +70,4 @@ def fill(image: Image, ground: Array, ink: Colour) -> None:
 
 def ink(colour: Array) -> tuple[int, ...]:
     """A colour as OpenCV draws with it."""
-    return tuple(int(value) for value in np.clip(colour, 0, 255))
+    return tuple(min(max(int(value), 0), 255) for value in colour.tolist())

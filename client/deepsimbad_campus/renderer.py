@@ -33,7 +33,7 @@ class Renderer:
         self._skyline, self._dome = world.skyline(), pictures.draw_sky(season, stream(seed, f"sky {date}"))
         radius = np.hypot(*np.mgrid[-GLARE_PX:GLARE_PX, -GLARE_PX:GLARE_PX]) / GLARE_PX
         self._glare = np.clip(1 - radius, 0, 1)[:, :, None] ** 3.0 * np.array(season.sun)
-        self._tiles, self._trees = pictures.draw_ground(season, date, seed), pictures.draw_trees(season, seed)
+        self._tiles, self.trees = pictures.draw_ground(season, date, seed), pictures.draw_trees(season, seed)
         self._facade = lru_cache(FACADES)(partial(pictures.draw_facade, season=season, drive=number))
         width, height = camera.UPRIGHT_SIZE
         grain = stream(seed, f"grain {date}").normal(0, GRAIN, (width + 64, height + 64, 1))
@@ -120,7 +120,7 @@ class Renderer:
                 for ahead, ends, span in things.panels(feet, view):
                     queue.append((ahead, partial(things.draw_panel, shot, self._facade, style, gain, ends, span)))
             for tree in section.trees:
-                stand(tree[0], 5.0, partial(things.draw_tree, shot, self._trees[tree[2]], tree))
+                stand(tree[0], 5.0, partial(things.draw_tree, shot, self.trees[tree[2]], tree))
             for post in section.posts:
                 stand(post[0], 1.5, partial(things.draw_post, shot, post))
             for car in (*things.parked(section, drive), *things.driving(section, drive, route, shot.time_s)):

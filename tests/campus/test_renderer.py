@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deepsimbad_campus.camera import HEIGHT, WIDTH, View, clip_near, project
-from deepsimbad_campus.pictures import draw_facade, draw_trees
+from deepsimbad_campus.pictures import draw_facade
 from deepsimbad_campus.renderer import Renderer
 from deepsimbad_campus.route import Drive, drive_length_m
 from deepsimbad_campus.season import PAPER_DATES, Light, drive_date, season_of
@@ -49,8 +49,7 @@ def test_winter_ground_is_whiter_and_summer_trees_are_fuller(renderers):
     assert white["winter"] > 0.25
     assert white["winter"] > 3 * max(white["spring"], white["autumn"])
     opaque = {
-        name: np.mean([levels[0][:300, :, 3] > 128 for levels in draw_trees(season_of(drive_date(name), 0), 0)[:11]])
-        for name in PAPER_DATES
+        name: np.mean([levels[0][:300, :, 3] > 128 for levels in renderers[name].trees[:11]]) for name in PAPER_DATES
     }
     assert opaque["winter"] < opaque["autumn"] < opaque["summer"]
 

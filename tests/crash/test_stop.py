@@ -22,6 +22,7 @@ from deepsimbad_client.http.local_server import LocalServer
 pytestmark = pytest.mark.slow
 
 N_LANDMARKS = 30
+ENDS = {signal.SIGTERM: 0, signal.SIGINT: 130}  # exit code by the signal that asked
 
 
 class Service(LocalServer):
@@ -139,13 +140,12 @@ class Robot:
         assert (state["n_observations"], state["belief"]) == (self.n_told, self.belief)
 
 
-@pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_what_was_acknowledged_is_there_afterwards(service: Service, by: int, code: int) -> None:
+def test_what_was_acknowledged_is_there_afterwards(service: Service) -> None:
     service.start()
     robots = [Robot(service, number) for number in range(8)]
     for robot in robots:
         robot.begin()
-    for _ in range(2):
+    for by, code in ENDS.items():
         threads = [threading.Thread(target=robot.until_refused) for robot in robots]
         before = sum(robot.n_told for robot in robots)
         for thread in threads:
@@ -232,17 +232,17 @@ def test_event_streams_end(service: Service) -> None:
     service.ask("DELETE", f"/v1/admin/jobs/{job['job_id']}")
 
 
-@pytest.mark.parametrize(("by", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_second_signal_does_not_wait(service: Service, by: int, code: int) -> None:
+def test_a_second_signal_does_not_wait(service: Service) -> None:
     service.environment = {"DEEPSIMBAD_SHUTDOWN_GRACE_S": "600"}
     service.start()
     robot = Robot(service, 1)
     robot.begin()
-    with send_frame(service, 5):
-        time.sleep(0.1)
-        service.signal(by)
-        until(lambda: is_stopping(service))
-        service.signal(by)
-        assert service.wait(60) == code
-    service.start()
-    assert service.ask("GET", f"/v1/sessions/{robot.session_id}")["n_observations"] == 0
+    for by, code in ENDS.items():
+        with send_frame(service, 5):
+            time.sleep(0.1)
+            service.signal(by)
+            until(lambda: is_stopping(service))
+            service.signal(by)
+            assert service.wait(60) == code
+        service.start()
+        assert service.ask("GET", f"/v1/sessions/{robot.session_id}")["n_observations"] == 0

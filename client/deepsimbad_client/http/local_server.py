@@ -5,11 +5,11 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
+from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from typing import Self
-
-import httpx2
 
 from deepsimbad_client.errors import DeepSimbadClientError
 
@@ -87,10 +87,12 @@ class LocalServer:
             self._process = None
 
     def _is_ready(self) -> bool:
-        try:
-            return httpx2.get(f"{self.url}/readyz", timeout=5.0, trust_env=False).status_code == httpx2.codes.OK
-        except httpx2.TransportError:
-            return False
+        with closing(HTTPConnection("127.0.0.1", self.port, timeout=5.0)) as connection:
+            try:
+                connection.request("GET", "/readyz")
+                return connection.getresponse().status == HTTPStatus.OK
+            except (OSError, HTTPException):
+                return False
 
 
 def _free_port() -> int:
