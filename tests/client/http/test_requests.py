@@ -124,7 +124,6 @@ def test_only_plain_http_to_this_machine_goes_unverified():
     assert [speaking_to(url, None, httpx2.Timeout(1)).get("verify", True) for url in urls] == [False, True, True, True]
 
 
-
 def test_media_type_of():
     types = {b"\xff\xd8\xff\xe0": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png", b"II*\0": "image/tiff"}
     types |= {b"MM\0*": "image/tiff", b"RIFF\n\0\0\nWEBPVP8 ": "image/webp", b"RIFF\0\0\0\0WAVE": None, b"": None}
