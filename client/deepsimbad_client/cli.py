@@ -12,9 +12,14 @@ def main() -> None:
     if missing:
         sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[replay]'\n")
         sys.exit(1)
-    from deepsimbad_client.commands import run  # noqa: PLC0415 - only now is it known to be there
+    try:
+        from deepsimbad_client.commands import run  # noqa: PLC0415 - only now is it known to be there
 
-    sys.exit(run())
+        code = run()
+    except KeyboardInterrupt:  # while it was loaded, which takes a second
+        sys.stderr.write("deepsimbad-client: cancelled\n")
+        code = 130
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -29,9 +29,14 @@ def main() -> None:
     # OpenBLAS's threads spin for 20 ms after each product, on cores that other work wants; 2^16 cycles are some ten
     # microseconds. Read when NumPy is loaded; an operator may set it otherwise.
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "16")
-    from deepsimbad.cli import run  # noqa: PLC0415 - only now is it known to be there
+    try:
+        from deepsimbad.cli import run  # noqa: PLC0415 - only now is it known to be there
 
-    sys.exit(run())
+        code = run()
+    except KeyboardInterrupt:  # while it was loaded, which takes a second
+        sys.stderr.write("cancelled\n")
+        code = 130
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -303,3 +303,22 @@ def test_the_script_without_the_extra_says_what_to_install(absent):
     )
     assert ended.returncode == 1
     assert ended.stderr == f"{absent} not installed: pip install 'deep-simbad[replay]'\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "loads", "says"),
+    [
+        ("deepsimbad.__main__", "deepsimbad.cli", "cancelled\n"),
+        ("deepsimbad_client.cli", "deepsimbad_client.commands", "deepsimbad-client: cancelled\n"),
+    ],
+)
+def test_a_ctrl_c_while_a_command_is_loaded_is_no_stack(command, loads, says):
+    ended = python(
+        "import signal, sys\n"
+        "class CtrlC:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {loads!r}: signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, CtrlC())\n"
+        f"from {command} import main\nmain()"
+    )
+    assert (ended.returncode, ended.stderr) == (130, says)
