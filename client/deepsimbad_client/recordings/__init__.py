@@ -1,4 +1,4 @@
-"""Recordings as they lie on disk: what every reader gives, and how image files are read and made ready to post."""
+"""Recordings as they lie on disk: what every reader gives and leaves out, and how images are made ready to post."""
 
 import dataclasses
 import math

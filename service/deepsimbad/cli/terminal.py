@@ -200,8 +200,8 @@ def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -
 
 
 def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
-    """A table on standard output, whole where that is no terminal, and remarks below; all but names may be numbers."""
-    for column in table.columns[1:] if numbers else ():
+    """A table on standard output, whole where that is no terminal, and remarks in lines below it."""
+    for column in table.columns[1:] if numbers else ():  # the first holds names
         column.justify = "right"
     console = Console(width=None if sys.stdout.isatty() else 160)
     console.print(table)

@@ -5,7 +5,7 @@ are numbered from 0 without gaps, and each holds what a domain is from there on,
 that serves, or nothing of one that was deleted. To write the next number, which of many at once only one can, is the
 one conditional write of an activation: every kind of store has it, where a folder cannot replace by ETag. The first
 entry names the store. `state.json.gz` is all domains as of some entry, so that a new node need not read the log from
-its beginning. Nothing is ever removed.
+its beginning. Nothing is ever removed. `MapCache` keeps files of the maps on this machine.
 """
 
 import gzip
