@@ -21,6 +21,7 @@ from deepsimbad.errors import (
     UnknownTraverseError,
     WeightsDifferError,
 )
+from deepsimbad.store import traverses
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.traverses import Traverse
 
@@ -121,6 +122,20 @@ def test_a_deleted_traverse_takes_no_more_frames(summer: Traverse, campus: Catal
         with pytest.raises(UnknownTraverseError):
             summer.put_frames(make_frames([1]))
         assert anew.n_frames == 0
+
+
+def test_one_that_is_deleted_while_it_is_opened_is_unknown(
+    summer: Traverse, campus: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opening = traverses.open_working_file
+
+    def too_late(*given: Any, **more: Any) -> Any:
+        Traverse.delete(campus.data_dir, "campus", summer.name)
+        return opening(*given, **more)
+
+    monkeypatch.setattr(traverses, "open_working_file", too_late)
+    with pytest.raises(UnknownTraverseError):
+        Traverse.open(campus.data_dir, "campus", summer.name)
 
 
 def test_a_stale_log_is_not_replayed_into_a_new_traverse(campus: Catalog, make_frames: MakeFrames) -> None:

@@ -24,6 +24,7 @@ from deepsimbad.core.relevance import shows_nothing
 from deepsimbad.errors import (
     ConflictError,
     DamagedFileError,
+    DeepSimbadError,
     FramesDifferError,
     GreyLevelsDifferError,
     InvalidEncodingError,
@@ -111,8 +112,13 @@ class Traverse(Spool):
         path = layout.traverse_path(data_dir, domain, name)
         if not path.is_file():
             raise _unknown(data_dir, domain, name)
-        with storage_faults(path):
-            return cls(name, path, open_working_file(path, migrations, is_checked=False))
+        try:
+            with storage_faults(path):
+                return cls(name, path, open_working_file(path, migrations, is_checked=False))
+        except DeepSimbadError as error:
+            if path.is_file():
+                raise
+            raise _unknown(data_dir, domain, name) from error  # it was deleted this moment
 
     @classmethod
     def delete(cls, data_dir: Path, domain: str, name: str) -> None:
