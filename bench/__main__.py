@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator
 
 from bench.answering import retrieval_table, step_table
 from bench.building import composed_table, landmark_table, map_file_table, nnql_table
-from bench.common import machine, write_page
 from bench.index_size import index_table
+from bench.measurement import machine, write_page
 from bench.remap import remap_table
 from bench.serving import http_table, restart_table, session_table
 

@@ -6,7 +6,7 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.common import ACTIONS_M, Timing, duration, interleaved, markdown
+from bench.measurement import ACTIONS_M, Timing, duration, interleaved, markdown
 from bench.worlds import (
     ENCODING_DIM,
     LIST_LENGTH,

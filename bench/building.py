@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import ACTIONS_M, duration, markdown, timed
+from bench.measurement import ACTIONS_M, duration, markdown, timed
 from bench.worlds import (
     ENCODING_DIM,
     N_CANDIDATES,

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import Limit, breaches, limit_table, machine, write_page
 from bench.link import JSON, Link
+from bench.measurement import Limit, breaches, limit_table, machine, write_page
 from bench.serving import mapped_service
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 import torch
 
-from bench.common import Timing, interleaved, machine, markdown, timed, write_page
 from bench.link import Link
+from bench.measurement import Timing, interleaved, machine, markdown, timed, write_page
 from bench.robots import LiveRobot, Waits, drive
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute, Runtime

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import duration, machine, markdown, real_recordings, write_page
+from bench.measurement import duration, machine, markdown, real_recordings, write_page
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.metrics import RetrievalScores, mean_interval
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import machine, markdown, real_recordings, write_page
+from bench.measurement import machine, markdown, real_recordings, write_page
 from bench.nordland import kept_frames, season_folder
 from deepsimbad.cli import run
 from deepsimbad_campus.writer import write_campus

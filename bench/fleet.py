@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import duration, machine, markdown, write_page
 from bench.link import GoneError, Link, RefusedError
+from bench.measurement import duration, machine, markdown, write_page
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import export_map

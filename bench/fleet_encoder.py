@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.common import Timing, duration, interleaved, machine, markdown, write_page
 from bench.link import Link
+from bench.measurement import Timing, duration, interleaved, machine, markdown, write_page
 from deepsimbad.settings import MEBIBYTE
 from deepsimbad_client.http.local_server import LocalServer
 

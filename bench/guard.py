@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import machine, markdown, real_recordings, write_page
+from bench.measurement import machine, markdown, real_recordings, write_page
 from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
 from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
 from deepsimbad.core.landmark_model import select_landmarks

@@ -21,9 +21,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.common import machine, markdown
 from bench.link import BINARY, JSON, Link
 from bench.load import Sample
+from bench.measurement import machine, markdown
 from bench.robots import LiveRobot, drive
 from bench.soak.actor import BASE, DOMAIN, N_LANDMARKS, make_domain
 from deepsimbad_client.http.local_server import LocalServer

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bench.common import ACTIONS_M, Limit, limit_table, markdown, real_recordings
+from bench.measurement import ACTIONS_M, Limit, limit_table, markdown, real_recordings
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, rrf_map, scattered_lists
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive

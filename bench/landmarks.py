@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import duration, machine, markdown, real_recordings, timed, write_page
+from bench.measurement import duration, machine, markdown, real_recordings, timed, write_page
 from bench.quantised import LIST_LENGTH, composed_places, k_means, netvlad_drives, row_of, scored
 from deepsimbad.core import composed
 from deepsimbad.core.building import Built, MapPlan, compose_map

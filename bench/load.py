@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import machine, markdown
 from bench.link import GoneError, Link, RefusedError
+from bench.measurement import machine, markdown
 from deepsimbad_client.http.local_server import LocalServer
 
 N_ROBOTS, SESSION_LENGTH = 20, 120

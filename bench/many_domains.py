@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import ACTIONS_M, duration, machine, markdown, real_recordings, timed, write_page
+from bench.measurement import ACTIONS_M, duration, machine, markdown, real_recordings, timed, write_page
 from bench.worlds import LIST_LENGTH, composed_map, scattered_lists
 from deepsimbad.core.atlas import Atlas, posterior
 from deepsimbad.core.building import MapPlan, compose_map

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.common import Timing, interleaved, machine, markdown, write_page
+from bench.measurement import Timing, interleaved, machine, markdown, write_page
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.nets.netvlad import STAGES, NetVlad
 from deepsimbad.evaluators.runtimes import make_run

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import ACTIONS_M, machine, markdown, real_recordings, write_page
+from bench.measurement import ACTIONS_M, machine, markdown, real_recordings, write_page
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values

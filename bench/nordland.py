@@ -16,7 +16,7 @@ from typing import Any
 
 import cv2
 
-from bench.common import machine, markdown, real_recordings, write_page
+from bench.measurement import machine, markdown, real_recordings, write_page
 from deepsimbad_client import Client
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.local_server import LocalServer

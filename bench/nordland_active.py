@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.common import machine, real_recordings, write_page
+from bench.measurement import machine, real_recordings, write_page
 from bench.nordland import DOMAIN, REMAP, drive_folders, make_domain
 from deepsimbad_client import Client
 from deepsimbad_client.http.admin import remap

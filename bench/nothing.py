@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import ACTIONS_M, machine, markdown, real_recordings, write_page
+from bench.measurement import ACTIONS_M, machine, markdown, real_recordings, write_page
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import machine, markdown, real_recordings, write_page
+from bench.measurement import machine, markdown, real_recordings, write_page
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive

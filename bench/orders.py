@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import machine, markdown
+from bench.measurement import machine, markdown
 
 Documents = Mapping[str, dict[str, Any]]  # by landmarks-map-test
 READY = ("--evaluator", "feature_l2:none")  # of files of encodings

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import machine, markdown, real_recordings, write_page
+from bench.measurement import machine, markdown, real_recordings, write_page
 from deepsimbad.core.building import Built, MapPlan, compose_map
 from deepsimbad.core.composed import list_weights, unit
 from deepsimbad.core.drive import Drive

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import Limit, breaches, limit_table, markdown
 from bench.link import Link
+from bench.measurement import Limit, breaches, limit_table, markdown
 from bench.robots import LiveRobot, Waits, drive, jpegs
 from bench.worlds import ENCODING_DIM, N_CANDIDATES, N_LANDMARKS, NCLT_IMAGES, SPACING_M, write_seasons
 from deepsimbad_client import Client

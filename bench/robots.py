@@ -9,8 +9,8 @@ from functools import partial
 import cv2
 import numpy as np
 
-from bench.common import duration
 from bench.link import JSON, Link, RefusedError
+from bench.measurement import duration
 from deepsimbad_campus.renderer import Renderer
 from deepsimbad_campus.route import Drive, drive_length_m
 from deepsimbad_campus.season import PAPER_DATES, drive_date

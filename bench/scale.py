@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bench.common import markdown, write_page
+from bench.measurement import markdown, write_page
 from deepsimbad.fleet.placement import owners
 
 MEBIBYTE = 2**20

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.common import ACTIONS_M, machine, markdown
+from bench.measurement import ACTIONS_M, machine, markdown
 from deepsimbad.core.building import MapPlan, SeenTwice, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import Timing, markdown, timed
 from bench.link import Link
+from bench.measurement import Timing, markdown, timed
 from bench.robots import LiveRobot, drive
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import Limit, breaches, limit_table, machine, markdown
+from bench.measurement import Limit, breaches, limit_table, machine, markdown
 from bench.soak.trial import LONGEST_LIFE_S, Soak, soak
 
 READY_WITHIN_S = 2.0

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from bench.common import Limit, breaches
+from bench.measurement import Limit, breaches
 from bench.remap import RemapFigures, Remapped, RemapSize, report
 from bench.robots import LiveRobot, Waits
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.common import breaches
+from bench.measurement import breaches
 from bench.soak.__main__ import limits, report
 from bench.soak.actor import LostError, expect
 from bench.soak.trial import Soak, soak
