@@ -3,7 +3,6 @@
 from statistics import NormalDist
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +13,6 @@ from deepsimbad.core.descriptor import (
     rank_landmarks,
     ranks_from_ranked_landmarks,
 )
-from deepsimbad.errors import InvalidDissimilaritiesError, InvalidRankedLandmarksError
 
 
 @given(st.lists(st.integers(0, 6), min_size=1, max_size=30))
@@ -27,21 +25,9 @@ def test_ranks_count_nearer_landmarks_and_earlier_ties(dissimilarities):
     assert rank_landmarks([dissimilarities] * 2).tolist() == [expected] * 2
 
 
-@pytest.mark.parametrize("bad", [[1.0, float("nan")], [float("inf"), 1.0], [], 3.0])
-def test_bad_dissimilarities_are_refused(bad):
-    with pytest.raises(InvalidDissimilaritiesError):
-        rank_landmarks(bad)
-
-
 def test_unsent_landmarks_share_the_mean_of_the_ranks_left():
     assert ranks_from_ranked_landmarks([3, 1], 6).tolist() == [4.5, 2.0, 4.5, 1.0, 4.5, 4.5]
     assert ranks_from_ranked_landmarks([1, 0, 2], 3).tolist() == [2.0, 1.0, 3.0]
-
-
-@pytest.mark.parametrize("bad", [[], [0, 0], [-1], [4], [0, 1, 2, 3, 1], [2**70]])
-def test_bad_ranked_landmarks_are_refused(bad):
-    with pytest.raises(InvalidRankedLandmarksError):
-        ranks_from_ranked_landmarks(bad, 4)
 
 
 def test_how_many_landmarks_have_a_rank_of_their_own():

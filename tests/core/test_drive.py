@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, Drive, judge, second_season
+from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, Drive, judge
 from deepsimbad.core.route import Route, same_places
-
-from .conftest import a_drive
 
 R = 40
 
@@ -196,46 +194,6 @@ def test_a_long_route_is_judged_always_alike():
     found = judge(own, other, diagonal(6_000), np.arange(6_000.0))
     assert found.accepted
     assert found == judge(own, other, diagonal(6_000), np.arange(6_000.0))
-
-
-# --- whether positions are comparable ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("said", "planes", "accepted", "why"),
-    [
-        (True, (False, False), True, None),
-        (True, (True, True), True, None),
-        (None, (True, True), True, None),
-        (None, (True, False), False, "without x, y of both drives nothing says"),
-        (None, (False, False), False, "without x, y of both drives nothing says"),
-        (False, (True, True), False, "are said not to share their positions"),
-    ],
-)
-def test_positions_must_be_said_to_be_comparable(said, planes, accepted, why):
-    rng = np.random.default_rng(16)
-    place = scenery(rng, 100)
-    own, other = (
-        a_drive(seen, **({"x_m": np.arange(100.0), "y_m": np.zeros(100)} if plane else {}))
-        for seen, plane in zip(dissimilarities(rng, place, place), planes, strict=True)
-    )
-    asked = []
-    season, measured, found = second_season(own, False, other, said, lambda drive: asked.append(drive) or drive)
-    assert found.accepted is accepted
-    assert asked == ([other] if accepted else []), "a drive that cannot be compared is not described"
-    if accepted:
-        assert (measured, season.places.tolist()) == (other, diagonal(100).tolist())
-        assert season.dissimilarities is other.dissimilarities
-    else:
-        assert (season, measured) == (None, None)
-        assert why in found.why
-
-
-def test_said_comparable_is_not_enough():
-    rng = np.random.default_rng(17)
-    own, other = map(a_drive, dissimilarities(rng, scenery(rng, 100), scenery(rng, 100)))
-    season, _, found = second_season(own, False, other, True, lambda drive: drive)
-    assert (season, found.accepted) == (None, False)
 
 
 def test_pictures_of_nothing_and_of_a_camera_that_hung_are_told_by_name() -> None:

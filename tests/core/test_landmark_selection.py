@@ -27,10 +27,6 @@ def test_duplicates_come_last_and_ties_go_by_index():
     np.testing.assert_array_equal(select_landmarks(candidates, 5), slow_selection(candidates, 5))
 
 
-def test_one_candidate_is_its_own_landmark():
-    assert select_landmarks(np.ones((1, 3), np.float32), 1).tolist() == [0]
-
-
 def test_too_few_candidates_and_bad_numbers_are_named():
     with pytest.raises(TooFewCandidatesError, match="3 candidates for 4"):
         select_landmarks(np.eye(3, dtype=np.float32), 4)

@@ -42,19 +42,6 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
     assert localization.shortlist.tolist() == np.argsort(-localization.relevance, kind="stable").tolist()
 
 
-@pytest.mark.parametrize("relevance", list(Relevance))
-@pytest.mark.parametrize("closed", [False, True])
-def test_every_relevance_finds_its_own_image(relevance: Relevance, closed: bool) -> None:
-    snapshot = map_contents(relevance=relevance, closed=closed)
-    encodings = np.random.default_rng(1).normal(size=(N_IMAGES, DIM)).astype(np.float32)
-    hits = 0
-    for image in range(N_IMAGES):
-        localization = localize(snapshot, EVALUATOR, ReadyEncoding(encodings[image].astype(np.float64)), 5)
-        hits += image in localization.shortlist
-        assert localization.belief.histogram_mass.sum() == pytest.approx(1)
-    assert hits >= 0.8 * N_IMAGES
-
-
 def test_huge_dissimilarities_are_ranked_all_the_same() -> None:
     query = describe(map_contents(relevance=Relevance.SIMBAD), EVALUATOR, Dissimilarities(np.linspace(1e300, 1, 9)))
     assert query.ranks.tolist() == list(range(9, 0, -1))

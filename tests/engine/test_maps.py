@@ -19,8 +19,6 @@ from deepsimbad.errors import (
     NoActiveMapError,
     RetiredMapError,
     UnavailableError,
-    UnknownDomainError,
-    UnknownMapVersionError,
 )
 from deepsimbad.store import catalog_maps
 from deepsimbad.store.catalog import Catalog
@@ -34,16 +32,6 @@ from .conftest import N_IMAGES, Clock, Live, add_domain, add_map, map_contents, 
 @pytest.fixture
 def maps(mapped: Catalog, clock: Clock) -> Maps:
     return Maps(mapped, clock)
-
-
-def test_nothing_to_serve(catalog: Catalog, maps: Maps) -> None:
-    with pytest.raises(UnknownDomainError):
-        maps.active("other")
-    add_domain(catalog, "new")
-    with pytest.raises(NoActiveMapError, match="remap"):
-        maps.active("new")
-    assert maps.peek("new") is None
-    assert maps.n_loaded == 0
 
 
 def test_a_switch_is_seen_at_once_when_told_and_soon_when_not(catalog: Catalog, maps: Maps, clock: Clock) -> None:
@@ -181,15 +169,6 @@ def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:
         assert retention_of(live).prune("e") == 1
         assert len(with_files(mapped)) == 4
         assert retention_of(live).prune() == 2
-
-
-def test_what_serves_or_is_being_built_is_not_removed(mapped: Catalog) -> None:
-    building = mapped.begin_map("d", {})
-    with running(mapped) as live:
-        for version, error in ((1, MapInUseError), (building, MapInUseError), (9, UnknownMapVersionError)):
-            with pytest.raises(error):
-                retention_of(live).remove("d", version)
-        assert mapped.map_path("d", 1).is_file()
 
 
 def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped: Catalog) -> None:

@@ -77,27 +77,6 @@ def test_every_truth_is_ranked_in_the_belief_of_its_time(
     run(catalog, body, max_sessions=2)
 
 
-def test_truths_are_kept_and_what_was_told_before_is_answered(mapped: Catalog) -> None:
-    async def body(live: Live) -> None:
-        truths = truths_of(live)
-        session_id, _ = await driven(live, [ranked(seed, 0.5) for seed in range(4)])
-        first, before = await truths.keep(session_id, [1.0, None, 2.0, None])
-        assert before is None
-        assert first.new_since(before).size == 2
-        again, before = await truths.keep(session_id, [1.0, None, 2.0, None])
-        assert again.new_since(before).size == 0
-        await live.sessions.observe(session_id, ranked(9, 0.5))
-        more, before = await truths.keep(session_id, [1.0, 1.5, 2.0, None, 3.0])
-        np.testing.assert_array_equal(more.new_since(before), more.rank_share[[1, 4]])
-        unknown, _ = await truths.keep(session_id, [None] * 5)
-        assert (unknown.n_scored, unknown.n_left_out, unknown.anr) == (0, 5, None)
-        await truths.keep(session_id, [None, 1.25, None, None, None])
-        stored = live.store.true_positions(live.store.find(session_id).number)
-        np.testing.assert_array_equal(stored, [1.0, 1.25, 2.0, NAN, 3.0])
-
-    run(mapped, body)
-
-
 def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes while a session is replayed waits for a piece of it, not for all."""
     monkeypatch.setattr(session_module, "_PIECE_S", 0.0)

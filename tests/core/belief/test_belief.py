@@ -45,13 +45,6 @@ def test_a_view_that_answers_every_place_alike_changes_nothing(kind, rule, route
     assert after.off_route == pytest.approx(0.02)
 
 
-def test_additive_relevance_adds_to_the_papers_weights(route):
-    relevance = np.linspace(0, 1, 100)
-    belief = GridFilter.uniform(route, UpdateRule.ADDITIVE_RELEVANCE)
-    belief = belief.updated(seen(relevance, UpdateRule.ADDITIVE_RELEVANCE), step=0)
-    np.testing.assert_allclose(belief.mass, (1 + relevance) / (1 + relevance).sum(), rtol=1e-6)
-
-
 def test_reciprocal_rank_shares_the_ranks_of_ties():
     belief = GridFilter.uniform(Route(np.arange(4.0)), UpdateRule.ADDITIVE_RECIPROCAL_RANK)
     belief = belief.updated(seen([5, 1, 1, 0], UpdateRule.ADDITIVE_RECIPROCAL_RANK), step=0)
@@ -229,16 +222,6 @@ def test_a_move_equals_its_definition(closed, action, std):
     assert moved.mass.sum() == pytest.approx(1)
 
 
-@pytest.mark.parametrize("kind", list(FilterKind))
-def test_a_move_ends_where_the_route_ends_within_its_error(kind, route):
-    near_end = FILTERS[kind].around(route, 98.5, 0.3)
-    assert near_end.predicted(1.5, 0.4, step=1).mass[95:].sum() > 0.98
-    with pytest.raises(PastTheEndError):
-        near_end.predicted(20.0, 0.3, step=1)
-    with pytest.raises(PastTheEndError):
-        FILTERS[kind].around(route, 3.0, 0.5).predicted(-20.0, 0.3, step=1)
-
-
 def test_what_leads_past_the_end_is_lost(route):
     partly = holding(route, np.ones(100)).predicted(20.0, 1e-9, step=1)
     assert partly.off_route == pytest.approx(0.2 * 0.98 + 0.8 * (1 - np.exp(-0.01)))
@@ -413,11 +396,6 @@ def test_particles_past_the_end_of_an_open_route_die():
     assert belief.position_m.min() > 25  # a tenth of the move is its error
     assert belief.off_route > 0.3
     assert belief.mass.sum() == pytest.approx(1)
-
-
-def test_particles_on_a_loop_come_round():
-    belief = ParticleFilter.around(Route(np.arange(100.0), closed=True), 97.0, 0.5, 500, seed=0).predicted(5.0, 0.1, 1)
-    assert belief.mass[[0, 1, 2, 3, 4]].sum() > 0.98
 
 
 def test_moves_said_to_be_exact_spread_nothing():
