@@ -164,14 +164,22 @@ def test_arrays_travel_as_npz_and_npy():
     stored = answer(200, {"n_new": 2, "n_replaced": 0, "n_frames": 2})
     script = Script(stored, httpx2.Response(200, content=packed.getvalue()))
     client = script.client()
-    client.admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0, 5], position_m=[0, 1.5])
+    client.admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0.0, 5.0], position_m=[0, 1.5])
     assert client.relevances("d", ranked_landmarks=[0]).tolist() == [0.5, -1.0]
     frames, relevances = script.requests
     with np.load(BytesIO(frames.content)) as sent:
         assert sorted(sent) == ["encodings", "index", "position_m"]
         assert sent["encodings"].dtype == np.float32
+        assert sent["index"].dtype == np.int64
         assert sent["index"].tolist() == [0, 5]
     assert frames.headers["content-type"] == relevances.headers["accept"] == "application/octet-stream"
+
+
+def test_an_index_that_is_no_whole_number_is_not_cut_to_one():
+    script = Script(answer(200, {"n_new": 1, "n_replaced": 0, "n_frames": 1}))
+    script.client().admin.put_frames("d", "t", encodings=[[1.0]], index=[0.5], position_m=[0])
+    with np.load(BytesIO(script.requests[0].content)) as sent:
+        assert sent["index"].tolist() == [0.5], "which the service refuses"
 
 
 @pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"\x93NUMPY\x01\x00"])
