@@ -18,6 +18,7 @@ from deepsimbad.core.route import Route
 DEFAULT_N_PARTICLES = 1000
 _LEAST_PLACED = 4  # particles where a robot that was lost may be
 _NEGLIGIBLE = 1e-3  # of the belief; particles that hold no more are given up without drawing all anew
+_EVENNESS = 0.5  # the power of its weight by which a particle is drawn: unlikely places keep some, of less weight each
 _START, _RETURN, _MOVE, _RESAMPLE = range(4)  # what a draw is for; part of its seed
 
 
@@ -194,23 +195,26 @@ class ParticleFilter:
     def _resampled(self, step: int, n_particles: int | None = None) -> Self:
         """Systematic resampling: one draw places an even comb over the cumulated weights.
 
-        All but the paper's are drawn anew from the stretches that they stand for, so that none is there twice.
+        All but the paper's are drawn anew from the stretches that they stand for, so that none is there twice, and by
+        the root of their weights (Liu, Chen and Logvinenko 2001): what is unlikely would else have none, and be
+        impossible when the next views speak for it.
         """
         n = n_particles or self.position_m.size
         together = self.doubt.trust @ self.weights
         if together.sum() <= 0:
             return self
         rng = np.random.default_rng([self.seed, step, _RESAMPLE])
+        drawn_by = together**_EVENNESS if self.doubt.is_mixture else together
         if self.doubt.is_mixture:
             order = np.argsort(self.position_m, kind="stable")
-            chosen = _comb(np.cumsum(together[order]), n, rng.random())
+            chosen = _comb(np.cumsum(drawn_by[order]), n, rng.random())
             low_m, high_m = _stretches(self.route, self.position_m[order])
             position_m = low_m[chosen] + rng.random(n) * (high_m - low_m)[chosen]
             chosen = order[chosen]
         else:
-            chosen = _comb(np.cumsum(together), n, rng.random())
+            chosen = _comb(np.cumsum(drawn_by), n, rng.random())
             position_m = self.position_m[chosen]
-        return self._of(position_m, np.ascontiguousarray(self.weights[:, chosen]) / together[chosen])
+        return self._of(position_m, np.ascontiguousarray(self.weights[:, chosen]) / drawn_by[chosen])
 
     def _of(self, position_m: NDArray[np.float64], weights: NDArray[np.float64]) -> Self:
         """Other particles, with as much of every trust's belief on the route as these have."""
