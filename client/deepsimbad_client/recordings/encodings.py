@@ -15,8 +15,8 @@ ENCODING_SUFFIXES = frozenset({".npy", ".csv"})
 def read_encodings(path: Path, spacing_m: float) -> Recording:
     """Read a file of ready encodings [n, d]; row i is `i * spacing_m` metres along the route.
 
-    A csv is numbers between commas; one line of words at its top is taken for a header. Raises SourceError (not a
-    table of finite numbers).
+    A csv is numbers between commas, semicolons (then with decimal commas too), tabs or blanks; one line of words at its
+    top is taken for a header. Raises SourceError (not a table of finite numbers).
     """
     try:
         raw = _read_npy(path) if path.suffix.lower() == ".npy" else _read_csv(path)
@@ -54,16 +54,18 @@ def _read_csv(path: Path) -> NDArray[np.generic]:
     """Line by line: what is wrong is then said with its line number."""
     rows: list[NDArray[np.float64]] = []
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
     except UnicodeDecodeError as error:
         raise SourceError(f"{path} is not text: {error}") from error
-    for number, line in enumerate(lines, 1):
-        cells = line.split(",")
-        if not line.strip() or (not rows and all(finite_number(cell) is None for cell in cells)):
-            continue  # blank, or a header
+    filled = [(number, line) for number, line in lines if line.strip()]
+    for number, line in filled:
+        separator = next((mark for mark in ";\t," if mark in line), None)  # None: blanks
+        cells = line.split(separator) if separator == "," else line.replace(",", ".").split(separator)
         try:
             row = np.array(cells, dtype=np.float64)
         except ValueError as error:
+            if number == filled[0][0] and all(finite_number(cell) is None for cell in cells):
+                continue  # a header
             raise SourceError(f"{path}, line {number}: {error}") from error
         if rows and len(row) != len(rows[0]):
             raise SourceError(f"{path}, line {number}: {len(row)} values where the lines before have {len(rows[0])}")

@@ -128,6 +128,16 @@ def test_damaged_and_disguised_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text", ["1.5,2\n-3,4e1", "a;b\n1,5;2\n-3;40,0", "1.5\t2\n-3\t40", "# a b\n1.5 2\n\n -3  40\n"]
+)
+def test_a_csv_is_numbers_as_programs_separate_them(tmp_path, text):
+    (tmp_path / "e.csv").write_text(text)
+    encodings = open_source(str(tmp_path / "e.csv")).encodings
+    assert encodings is not None
+    assert encodings.tolist() == [[1.5, 2], [-3, 40]]
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("1,2\n3\n", "line 2: 1 values where the lines before have 2"),
@@ -135,6 +145,8 @@ def test_damaged_and_disguised_files_are_refused(tmp_path):
         ("", "holds no encodings"),
         ("a,b\n", "holds no encodings"),
         ("1,2\n\n3,nan\n", "1 rows hold NaN.*row 1"),
+        ("nan,nan\n3,4\n", "1 rows hold NaN.*row 0"),
+        ("a,b\nc,d\n3,4\n", "line 2: could not convert"),
     ],
 )
 def test_a_bad_csv_is_refused_with_its_line(tmp_path, text, message):
