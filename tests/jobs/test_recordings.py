@@ -139,8 +139,14 @@ def objects(*rows):
         (np.array([[1, -1], [0, 2], [-1, -1]]), [0, 1, 2], [0, 1, 2], [[1], [0, 2], []]),
         (np.array([[10], [11], [12], [13]]), [1, 3], [11, 12, 13], [[0], [2]]),
         (np.array([[0, 99]]), [0], [0, 1], [[0]]),
+        (np.array([[False, True], [True, True], [False, False]]), [0, 1, 2], [0, 1], [[1], [0, 1], []]),
+        (np.array([[0, 0, 1], [1, 0, 0]], np.uint8), [0, 1], [0, 1, 2], [[2], [0]]),
+        (np.array([[0.0, 1.0], [1.0, 0.0]]), [0, 1], [0, 1], [[0, 1], [0, 1]]),
     ],
-    ids=["pairs", "any order, with gaps", "in frame order", "padded", "places in the recording", "not mapped"],
+    ids=[
+        *("pairs", "any order, with gaps", "in frame order", "padded", "places in the recording", "not mapped"),
+        *("true and false", "1 and 0", "two numbers"),
+    ],
 )
 def test_every_form_of_ground_truth(tmp_path, array, test_index, training_index, expected):
     np.save(tmp_path / "truth.npy", array, allow_pickle=True)
@@ -174,6 +180,8 @@ def test_a_malicious_pickle_runs_nothing(tmp_path):
         lambda path: path.write_bytes(b"\x93NUMPY\x01\x00"),
         lambda path: path.write_bytes(pickle.dumps([[0]])),
         lambda path: np.save(path, objects((0, ["a place"])), allow_pickle=True),
+        lambda path: np.save(path, np.array([[0.5, 1]])),
+        lambda path: np.save(path, np.array([[np.nan]])),
         lambda path: path.mkdir(),
     ],
 )

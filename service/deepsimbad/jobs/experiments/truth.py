@@ -54,7 +54,8 @@ def read_ground_truth(
 
     Args:
         path: An array [q, 2] whose rows are (test frame, list of training frames), as VPR-Bench writes it; or [q]
-            of lists, or [q, k] of numbers padded with -1, in test frame order.
+            of lists, [q, k] of numbers padded with -1, or [q, n] of true and false (1 and 0) for every training
+            frame, in test frame order.
         test_index: [m] places of the test frames in their recording.
         training_index: [n] the same of the training frames.
 
@@ -67,9 +68,10 @@ def read_ground_truth(
     rows = _load(path)
     try:
         if rows.dtype == object and rows.ndim == 2 and rows.shape[1] == 2:
-            accepted = {int(query): [int(t) for t in np.atleast_1d(truth)] for query, truth in rows}
+            accepted = {int(query): _frames(truth) for query, truth in rows}
         else:
-            accepted = {query: [int(t) for t in np.atleast_1d(truth)] for query, truth in enumerate(rows)}
+            lists = map(np.flatnonzero, rows) if _says_which(rows) else rows
+            accepted = {query: _frames(truth) for query, truth in enumerate(lists)}
     except (TypeError, ValueError) as error:
         raise InvalidSourceError(f"{path} holds no lists of frame numbers: {error}") from error
     place_of = {int(index): place for place, index in enumerate(training_index)}
@@ -77,6 +79,20 @@ def read_ground_truth(
         np.array(sorted(place_of[t] for t in accepted.get(int(index), ()) if t in place_of), np.int64)
         for index in test_index
     ]
+
+
+def _says_which(rows: NDArray[Any]) -> bool:
+    """Whether rows say of every frame if it is accepted: a list of more than two numbers names others than 0 and 1."""
+    may_be = rows.ndim == 2 and (rows.dtype == bool or (rows.dtype.kind in "iuf" and rows.shape[1] > 2))
+    return may_be and bool(np.isin(rows, (0, 1)).all())
+
+
+def _frames(accepted: Any) -> list[int]:
+    """The numbers of frames; raises ValueError and TypeError."""
+    frames = np.atleast_1d(accepted).tolist()
+    if any(frame != int(frame) for frame in frames):
+        raise ValueError(f"{frames} are no whole numbers")
+    return [int(frame) for frame in frames]
 
 
 def _load(path: Path) -> NDArray[Any]:
