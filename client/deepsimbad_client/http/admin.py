@@ -177,7 +177,9 @@ class AdminCalls(Face):
         together or not. `replace` is that of `put_frame`.
         """
         np = require_numpy()
-        columns: dict[str, tuple[Any, Any]] = {"encodings": (encodings, np.float32), "index": (index, np.int64)}
+        is_whole = np.array_equal(index, np.asarray(index).astype(np.int64))  # else the service refuses it
+        columns: dict[str, tuple[Any, Any]] = {"encodings": (encodings, np.float32)}
+        columns |= {"index": (index, np.int64 if is_whole else None)}
         columns |= {"position_m": (position_m, np.float64), "timestamp_us": (timestamp_us, np.int64)}
         if x_m is not None and y_m is not None:
             columns |= {"x_m": (x_m, np.float64), "y_m": (y_m, np.float64)}
