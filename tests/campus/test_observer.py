@@ -52,9 +52,23 @@ def test_what_is_not_told_is_named(tmp_path):
     told = as_taken(open_source(str(tmp_path)), {"text"})
     with pytest.raises(BrokenFrameError, match=r"captions\.csv says nothing of 1\.png"):
         told.image(told.frames[1], None)
-    (tmp_path / "detections.jsonl").write_text('{"name": "0.png"}\n')
-    with pytest.raises(SourceError, match="line 1"):
-        as_taken(open_source(str(tmp_path)), {"objects"})
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "says"),
+    [
+        ("detections.jsonl", '{"name": "0.png"}', "line 1: expected"),
+        ("detections.jsonl", '{"name": "0.png", "objects": null}', "line 1: expected"),
+        ("detections.jsonl", '{"name": "0.png", "objects": []}\n{"name": "0.png", "objects": []}', r"0\.png twice"),
+        ("captions.csv", "name,text\n0.png,a tree\n0.png,a car", r"0\.png twice"),
+        ("captions.csv", "name,text\n0.png,a tree, and a car", "line 2: more cells than the first"),
+    ],
+)
+def test_what_is_told_wrongly_is_named(tmp_path, file, text, says):
+    (tmp_path / "0.png").write_bytes(_png())
+    (tmp_path / file).write_text(text)
+    with pytest.raises(SourceError, match=says):
+        as_taken(open_source(str(tmp_path)), {"objects" if file == "detections.jsonl" else "text"})
 
 
 def _png():

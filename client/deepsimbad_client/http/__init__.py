@@ -190,8 +190,8 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
 
 def observed(told: Mapping[str, Any], image: bytes | None = None) -> Observation:
     """The body of a view that is told by objects, a text, or both; a form where an image goes with it."""
-    told = {name: value if isinstance(value, str) else list(value) for name, value in told.items()}
     try:
+        told = {name: value if isinstance(value, str) else list(value) for name, value in told.items()}
         if image is None:
             return Observation(json_of(told).encode(), "application/json")
         parts = {name: value if isinstance(value, str) else json_of(value) for name, value in told.items()}

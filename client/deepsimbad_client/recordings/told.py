@@ -63,7 +63,7 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
     for form in forms:
         file = None if folder is None else _file(folder, FORMS[form])
         if file is not None:
-            told[form] = dict(_read(file, form))
+            told[form] = _read(file, form)
     if not told and "image" in takes:
         return recording
     if not told:
@@ -84,24 +84,38 @@ def _file(folder: Path, name: str) -> Path | None:
     return next((place / name for place in places if (place / name).is_file()), None)
 
 
-def _read(file: Path, form: str) -> Iterator[tuple[str, Any]]:
+def _read(file: Path, form: str) -> dict[str, Any]:
+    told: dict[str, Any] = {}
+    for name, what in _rows(file, form):
+        if name in told:
+            raise SourceError(f"{file} tells of {name} twice")
+        told[name] = what
+    return told
+
+
+def _rows(file: Path, form: str) -> Iterator[tuple[str, Any]]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as lines:
             if form == "text":
                 table = csv.DictReader(lines)
                 if not {"name", "text"} <= set(table.fieldnames or ()):
                     raise SourceError(f"{file}: its first line names the columns name and text")
-                yield from ((row["name"], row["text"] or "") for row in table)
+                for row in table:
+                    if None in row:
+                        more = "more cells than the first: put a text with commas between quotes"
+                        raise SourceError(f"{file}, line {table.line_num}: {more}")
+                    yield row["name"], row["text"] or ""
                 return
             for number, line in enumerate(lines, 1):
                 if not line.strip():
                     continue
                 try:
                     row = json.loads(line)
-                    yield row["name"], row["objects"]
+                    name, objects = row["name"], list(row["objects"])
                 except (ValueError, KeyError, TypeError) as error:
                     raise SourceError(
                         f'{file}, line {number}: expected {{"name": "1.jpg", "objects": [...]}}'
                     ) from error
+                yield name, objects
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SourceError(f"{file} cannot be read: {error}") from error

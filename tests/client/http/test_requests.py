@@ -63,7 +63,7 @@ def test_what_a_robot_encodes_itself_travels_as_json(form, body):
 def test_what_can_never_be_sent_is_refused_here(tmp_path):
     images = ({"image": b"\xff\xd8\xff", "encoding": [1.0]}, {"image": b"GIF89a"})
     numbers = ({"dissimilarities": [float("nan")]}, {"encoding": np.array([np.inf])}, {"ranked_landmarks": [object()]})
-    numbers += ({"encoding": [np.float32("nan")]},)
+    numbers += ({"encoding": [np.float32("nan")]}, {"objects": 5})
     for form in ({}, *images, *numbers):
         with pytest.raises(InvalidArgumentError):
             observation(**form)
