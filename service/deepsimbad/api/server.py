@@ -122,8 +122,8 @@ class _Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Open the application and listen, and say so when both are done."""
         await super().startup(sockets)
+        gc.collect()
         gc.freeze()  # what is there stays, and looking through it again would stop all answers for a tenth of a second
-        gc.enable()
         addresses = [listening.getsockname()[:2] for server in self.servers for listening in server.sockets]
         host, port = addresses[0]
         reached = "localhost" if host in {"0.0.0.0", "::"} else f"[{host}]" if ":" in host else host  # noqa: S104

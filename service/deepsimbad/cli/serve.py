@@ -47,10 +47,12 @@ def address_options(command: Command) -> Command:
 @click.option("--create", is_flag=True, help="Make the data directory if it is not there.")
 def serve(host: str | None, port: int | None, create: bool) -> None:
     """Serve the domains over HTTP until interrupted. Ready when /readyz answers 200."""
-    gc.disable()  # a start leaves little behind, and looking for it would be an eighth of it; the server enables it
+    gc.disable()  # imports leave little behind, and looking for it, now and later, would be an eighth of a start
     from deepsimbad.api.server import configure_logging  # noqa: PLC0415 - other commands need no server
     from deepsimbad.api.server import serve as serve_until_stopped  # noqa: PLC0415
 
+    gc.freeze()
+    gc.enable()
     try:
         settings = given_settings(host=host, port=port)
         configure_logging(settings.log_level)
@@ -61,8 +63,6 @@ def serve(host: str | None, port: int | None, create: bool) -> None:
         configure_logging("ERROR")  # the settings themselves may be what is wrong
         log.error("cannot start", extra={"code": error.code, "why": error.message})
         raise
-    finally:
-        gc.enable()
 
 
 @click.command()
