@@ -1,5 +1,6 @@
 """Recordings become encodings beside positions, and what cannot be used is counted; ground truth files run nothing."""
 
+import json
 import os
 import pickle
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
-from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSourceError
+from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidSceneError, InvalidSourceError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
@@ -16,6 +17,7 @@ from deepsimbad.jobs.experiments.kept import kept_encodings
 from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
+from deepsimbad_client.recordings.told import as_taken
 
 MAX_PIXELS = 1_000_000
 
@@ -152,6 +154,15 @@ def test_every_form_of_ground_truth(tmp_path, array, test_index, training_index,
     np.save(tmp_path / "truth.npy", array, allow_pickle=True)
     truths = read_ground_truth(tmp_path / "truth.npy", np.array(test_index), np.array(training_index))
     assert [truth.tolist() for truth in truths] == expected
+
+
+def test_a_frame_that_is_told_wrongly_is_named(folder):
+    objects = {"0.png": [], "1.png": [{"label": "car", "box": [10, 20, 100, 200]}]}
+    lines = (json.dumps({"name": name, "objects": told}) for name, told in objects.items())
+    (folder / "detections.jsonl").write_text("\n".join(lines))
+    recording = as_taken(open_source(str(folder)), {"objects"})
+    with pytest.raises(InvalidSceneError, match=r"^1\.png: object 0: a box is"):
+        encode_recording(recording, make_evaluator(evaluator_config({"kind": "objects"})), MAX_PIXELS, lambda _: None)
 
 
 class Malice:

@@ -21,7 +21,7 @@ from deepsimbad.core.experience.training import LearningCurve, TrainingWorld, tr
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places
-from deepsimbad.errors import InvalidSourceError
+from deepsimbad.errors import InvalidSceneError, InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Fitted, Image, LandmarkModel
 from deepsimbad.evaluators.image import picture_size
 from deepsimbad.evaluators.scenes import Scene, check_whole, seen_in, shows_none
@@ -153,8 +153,11 @@ def encode_block(
             except BrokenFrameError as error:
                 broken[place] = error.reason
             else:
-                waiting[row] = seen_in(body.body, body.content_type, evaluator, max_pixels)
-                check_whole(evaluator, waiting[row])
+                try:
+                    waiting[row] = seen_in(body.body, body.content_type, evaluator, max_pixels)
+                    check_whole(evaluator, waiting[row])
+                except InvalidSceneError as error:
+                    raise InvalidSceneError(f"{frame.name}: {error.message}", **error.hints) from error
                 shows_nothing[row] = shows_none(waiting[row])
                 stamps.append(stamp)
                 readable.append(place)
