@@ -7,7 +7,7 @@ from typing import Any
 
 from ray.exceptions import RayError
 from ray.serve.exceptions import RayServeException
-from ray.serve.handle import DeploymentHandle
+from ray.serve.handle import DeploymentHandle, DeploymentResponse
 
 from deepsimbad.errors import UnavailableError
 from deepsimbad.fleet.backend import AWAY_S, BRIEFLY_S
@@ -39,10 +39,7 @@ class AllSessions(SharedSessionStore):
         for _, session_id in newest[:limit]:
             by_owner[session_owners(session_id, len(self.replicas))[0]].append(session_id)
         asked = [self.replicas[owner].listed.remote(session_ids) for owner, session_ids in by_owner.items()]
-        try:
-            listed = [entry for answer in asked for entry in answer.result(timeout_s=BRIEFLY_S)]
-        except (TimeoutError, RayError, RayServeException) as error:
-            raise UnavailableError("a replica is away, so its sessions cannot be listed: try again") from error
+        listed = _answers(asked, "a replica is away, so its sessions cannot be listed: try again")
         living = {
             entry.session.number: entry
             for entry in listed
@@ -64,15 +61,20 @@ class AllJobs:
             return catalog.newest_jobs(domain, before, limit)
         asked = [other.jobs.remote(before, limit + 1) for other in self.others]
         numbered = catalog.numbered_jobs(None, before, limit + 1)
-        try:
-            numbered += [entry for answer in asked for entry in answer.result(timeout_s=BRIEFLY_S)]
-        except (TimeoutError, RayError, RayServeException) as error:
-            for answer in asked:  # nobody waits for them any more
-                with suppress(RayError, RayServeException):  # which is what it would have answered
-                    answer.cancel()
-            raise UnavailableError(
-                "one of those that administer is away, so its jobs cannot be listed: try again, or ask for those of "
-                "one domain",
-                retry_after_s=AWAY_S,
-            ) from error
+        numbered += _answers(
+            asked,
+            "one of those that administer is away, so its jobs cannot be listed: try again, or ask for those of one "
+            "domain",
+        )
         return ListPage.of(sorted(numbered, key=lambda entry: entry[0], reverse=True), limit)
+
+
+def _answers(asked: Sequence[DeploymentResponse[Any]], away: str) -> list[Any]:
+    """All that those who were asked have, whose lists follow one another; raises UnavailableError, saying `away`."""
+    try:
+        return [entry for answer in asked for entry in answer.result(timeout_s=BRIEFLY_S)]
+    except (TimeoutError, RayError, RayServeException) as error:
+        for answer in asked:  # nobody waits for them any more
+            with suppress(RayError, RayServeException):  # which is what it would have answered
+                answer.cancel()
+        raise UnavailableError(away, retry_after_s=AWAY_S) from error
