@@ -19,7 +19,7 @@ from deepsimbad.jobs.build import Kept
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad_client.recordings import stamp_of
 
-_WRITTEN_EVERY = 500  # frames, which a run that is killed may have to encode again
+_LEAST_NEW, _NEW_SHARE = 500, 4  # frames, or a quarter of those written: the whole file is written each time
 
 
 @contextmanager
@@ -48,7 +48,7 @@ class _KeptInFile(UserDict[str, tuple[NDArray[np.float32], bool]]):
 
     def __setitem__(self, stamp: str, frame: tuple[NDArray[np.float32], bool]) -> None:
         super().__setitem__(stamp, frame)
-        if len(self) >= self._n_written + _WRITTEN_EVERY:
+        if len(self) >= self._n_written + max(_LEAST_NEW, self._n_written // _NEW_SHARE):
             self.write()
 
     def write(self) -> None:
