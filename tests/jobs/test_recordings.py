@@ -13,6 +13,7 @@ from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidScen
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
+from deepsimbad.jobs.experiments import kept as kept_module
 from deepsimbad.jobs.experiments.kept import kept_encodings
 from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad_client.recordings import Frame, Recording
@@ -70,6 +71,24 @@ def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, jud
     assert again.encode_ms is None, "nothing was encoded"
     assert again.drive.shows_nothing.tolist() == [False, False, False, True, False]
     assert first.drive.shows_nothing.tolist() == again.drive.shows_nothing.tolist()
+
+
+def test_a_run_that_is_killed_has_kept_what_it_encoded_now_and_then(tmp_path, monkeypatch):
+    monkeypatch.setattr(kept_module, "_LEAST_NEW", 3)
+    on_disk = []
+    with kept_encodings(tmp_path, "queries", source="drive") as kept:
+        for frame in range(17):
+            kept[str(frame)] = np.full(4, frame, np.float32), False
+            with kept_encodings(tmp_path, "queries", source="drive") as again:
+                on_disk.append(len(again))
+    assert on_disk == [0, 0, *[3] * 3, *[6] * 3, *[9] * 3, *[12] * 3, *[15] * 3]
+    monkeypatch.setattr(kept_module, "_NEW_SHARE", 1)
+    with kept_encodings(tmp_path, "queries", source="drive") as kept:
+        assert len(kept) == 17
+        for frame in range(17, 34):
+            kept[str(frame)] = np.full(4, frame, np.float32), False
+            with kept_encodings(tmp_path, "queries", source="drive") as again:
+                assert len(again) == (34 if frame == 33 else 17), "twice as many before they are written anew"
 
 
 def test_a_recording_of_broken_frames_alone_is_named(folder, judge):
