@@ -7,10 +7,12 @@ not send are judged by what is usual for them and by how they go together (`deep
 """
 
 import itertools
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import zip_longest
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -38,6 +40,8 @@ LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
 _DRIVES = ("nr", "nq", "nq2")
 _IMAGES_A_BLOCK = 16
 _EVALUATOR = FeatureL2("none")
+
+Packed: TypeAlias = PackedRanks | PackedUnitEncoding
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,8 @@ def encoded(drives: Drives, built: Map, n_bits: int) -> list[PackedUnitEncoding]
     return [PackedUnitEncoding(pack_unit_encoding(u, n_bits)) for u in unit_vectors(drives.test, built.landmark_model)]
 
 
-def anr(drives: Drives, built: Map, views: Sequence[PackedRanks | PackedUnitEncoding], how: str) -> tuple[float, float]:
-    """ANR in percent over the test drive, and milliseconds a view.
+def anr(drives: Drives, built: Map, views: Iterable[Packed], how: str) -> float:
+    """ANR in percent over the test drive.
 
     Args:
         drives: Where the test frames were taken.
@@ -87,16 +91,13 @@ def anr(drives: Drives, built: Map, views: Sequence[PackedRanks | PackedUnitEnco
         views: What was sent of every test frame.
         how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's.
     """
-    scorer, spent_s = RetrievalScorer(), 0.0
-    live = built.live_statistics
+    scorer, live = RetrievalScorer(), built.live_statistics
     for frame, view in enumerate(views):
         query = describe(built, _EVALUATOR, view)
-        began = time.perf_counter()
         live = live.observing(query) if live is not None and how == "session" else live
-        relevance = relevances(built, query, live)
-        spent_s += time.perf_counter() - began
-        scorer.add(relevance, np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE))
-    return scorer.result().anr, 1000 * spent_s / len(views)
+        truths = np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE)
+        scorer.add(relevances(built, query, live), truths)
+    return scorer.result().anr
 
 
 def netvlad(folder: Path) -> list[Drives]:
@@ -128,53 +129,41 @@ def _encoded(evaluator: Evaluator, season: Path, numbers: Sequence[int]) -> NDAr
 
 def table(triplets: Sequence[Drives]) -> Iterator[str]:
     """A Markdown line for every r and body, each figure the mean over the triplets."""
-    head = ("r", "sent", "bytes", "**composed**", "composed, views alone", "rrf", "ms a view")
+    head = ("r", "sent", "bytes", "**composed**", "composed, views alone", "rrf")
     return markdown(head, (row for n_landmarks in N_LANDMARKS for row in _rows(triplets, n_landmarks)))
 
 
 def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
     composed = [(drives, drives.map(Relevance.COMPOSED, n_landmarks)) for drives in triplets]
     rrf = [(drives, drives.map(Relevance.RRF, n_landmarks)) for drives in triplets]
-    columns = ((composed, "session"), (composed, "alone"), (rrf, "session"))
+    columns = [(composed, "session"), (composed, "alone"), (rrf, "session")]
     all_ranks: list[float] = []
     for m in (n_landmarks, *N_SENT, ranked_landmarks_within(BUDGET_BYTES, n_landmarks)):
-        sent = [[ranked(drives, built, m) for drives, built in maps] for maps, _ in columns]
-        means, ms = _means(columns, sent)
+        n_bytes, means = _measured(columns, partial(ranked, m=m))
+        costs = [f"{mean:.2f}{_cost(mean, best)}" for mean, best in zip_longest(means, all_ranks)]
         all_ranks = all_ranks or means
-        what = "all ranks" if m == n_landmarks else f"{m} ranks"
-        yield [str(n_landmarks), what, _bytes(sent), *_costs(means, all_ranks), ms]
+        yield [str(n_landmarks), "all ranks" if m == n_landmarks else f"{m} ranks", n_bytes, *costs]
     for n_bits in N_BITS:
-        sent = [[encoded(drives, built, n_bits) for drives, built in maps] for maps, _ in columns[:2]]
-        means, ms = _means(columns[:2], sent)
-        yield [str(n_landmarks), f"u, {n_bits} bits a number", _bytes(sent), *_costs(means, all_ranks), "", ms]
+        n_bytes, means = _measured(columns[:2], partial(encoded, n_bits=n_bits))
+        costs = [f"{mean:.2f}{_cost(mean, best)}" for mean, best in zip(means, all_ranks, strict=False)]
+        yield [str(n_landmarks), f"u, {n_bits} bits a number", n_bytes, *costs, ""]
 
 
-def _means(
-    columns: Sequence[tuple[Sequence[tuple[Drives, Map]], str]],
-    sent: Sequence[Sequence[Sequence[PackedRanks | PackedUnitEncoding]]],
-) -> tuple[list[float], str]:
-    """ANR of every column, and the milliseconds a view of the first."""
-    figures = np.array(
-        [
-            [anr(drives, built, views, how) for (drives, built), views in zip(maps, by_map, strict=True)]
-            for (maps, how), by_map in zip(columns, sent, strict=True)
-        ]
-    )
-    return figures[:, :, 0].mean(axis=1).tolist(), f"{figures[0, :, 1].mean():.1f}"
-
-
-def _bytes(sent: Sequence[Sequence[Sequence[PackedRanks | PackedUnitEncoding]]]) -> str:
-    n_bytes = len(sent[0][0][0].body)
-    return f"**{n_bytes}**" if n_bytes <= BUDGET_BYTES else str(n_bytes)
-
-
-def _costs(means: Sequence[float], all_ranks: Sequence[float]) -> list[str]:
-    """ANR, and how much worse than that of all ranks."""
-    costs = [f"{100 * (value / best - 1):+.0f} %" for value, best in zip(means, all_ranks, strict=False)]
-    return [
-        f"{value:.2f}" if means is all_ranks else f"{value:.2f} ({cost})"
-        for value, cost in zip(means, costs, strict=True)
+def _measured(
+    columns: Sequence[tuple[Sequence[tuple[Drives, Map]], str]], sent: Callable[[Drives, Map], Sequence[Packed]]
+) -> tuple[str, list[float]]:
+    """The bytes of a body, bold where the budget holds it, and the ANR of every column."""
+    n_bytes = len(sent(*columns[0][0][0])[0].body)
+    means = [
+        float(np.mean([anr(drives, built, sent(drives, built), how) for drives, built in maps]))
+        for maps, how in columns
     ]
+    return f"**{n_bytes}**" if n_bytes <= BUDGET_BYTES else str(n_bytes), means
+
+
+def _cost(mean: float, best: float | None) -> str:
+    """How much worse than all ranks; nothing where these are all ranks."""
+    return "" if best is None else f" ({100 * (mean / best - 1):+.0f} %)"
 
 
 def report(recordings: Path) -> Iterator[str]:
@@ -194,18 +183,20 @@ def report(recordings: Path) -> Iterator[str]:
         "by what is usual in it. Of a landmark that was not sent the score is the expected one, given the landmarks "
         "that were, how landmarks went together over the map's drive, and that it is farther than the last that was "
         "sent; its evidence counts by how much of it is known. `rrf`, which compares ranks, has no statistics and "
-        "takes the mean of the ranks left. Times are those of `composed` in a session, statistics and relevance, on a "
-        "machine shared with other work."
+        "takes the mean of the ranks left."
     )
     yield from ("", "Made by `python -m bench.onboard`.", "", machine(), "", "## NetVLAD encodings of Nordland", "")
     yield "Mean over the six landmark-training-test permutations of three drives, 600 places, 64 numbers each."
-    yield from ("", *table(netvlad(recordings / "nordland_netvlad64")), "")
+    yield ""
+    yield from table(netvlad(recordings / "nordland_netvlad64"))
+    yield ""
     yield from ("## Images of Nordland, winter on a summer map", "")
     yield (
         "Extractor efficientnet_lite0; landmarks come from another part of the route (summer 1000..1999), so no second "
         "season is known. Frames that show nothing are left out, as in [nordland-http.md](nordland-http.md)."
     )
-    yield from ("", *table(nordland(recordings / "nordland")))
+    yield ""
+    yield from table(nordland(recordings / "nordland"))
 
 
 if __name__ == "__main__":
