@@ -128,7 +128,7 @@ class OnBoardEncoder:
         """What `Client.localize` and `Session.observe` take as `on_board`; give exactly one form of the view.
 
         Of a map that compares encodings (`composed`) the unit encoding travels, in `n_bits` a number, 2 to 8: 61 bytes
-        for 96 numbers by default, which tell more than all ranks. Of others the ranks that 64 bytes hold, as of `ranks`.
+        for 96 numbers by default, which tell more than all ranks. Of others the ranks that 64 bytes hold.
 
         `image` is an encoded one, its path, or [height, width, 3] uint8 BGR. A picture that shows nothing travels as
         JSON that says so. Raises InvalidArgumentError, BrokenFrameError, and as `load_extractor`.
