@@ -5,14 +5,13 @@ number of the encoding how far along one of its own (docs/results/onboard.md). E
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.composed import unit
 from deepsimbad.core.descriptor import checked_ranking, wrong_number
-from deepsimbad.errors import InvalidEncodingError, InvalidRankedLandmarksError
+from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidRankedLandmarksError
 
 RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
 """Media types."""
@@ -48,16 +47,7 @@ def unpack_unit_encoding(body: bytes, n_numbers: int) -> NDArray[np.float32]:
         raise InvalidEncodingError("a packed unit encoding begins with its bits a number, in one byte")
     n_bits = body[0]
     steps = _steps(n_bits)
-    n_bytes = 1 + -(-n_numbers * n_bits // 8)
-    if len(body) != n_bytes:
-        raise InvalidEncodingError(
-            f"{n_numbers} numbers of {n_bits} bits are packed into {n_bytes} bytes, not {len(body)}: "
-            "is it the landmark model of another map?",
-            encoding_dim=n_numbers,
-        )
-    codes, rest = _from_bits(body[1:], n_numbers, n_bits)
-    if rest.any():
-        raise InvalidEncodingError("the bits behind the last number must be zero")
+    codes = _from_bits(body[1:], n_numbers, n_bits, InvalidEncodingError, encoding_dim=n_numbers)
     if codes.max() > 2 * steps:
         raise InvalidEncodingError(f"{codes.max()} is no number of {n_bits} bits: they go from 0 to {2 * steps}")
     return unit((codes - steps).astype(np.float32))
@@ -97,17 +87,8 @@ def unpack_ranked_landmarks(body: bytes, n_landmarks: int) -> tuple[int, ...]:
     n_sent, n_bits = int.from_bytes(body[:2], "big"), _bits_per_id(n_landmarks)
     if not 1 <= n_sent <= n_landmarks:
         raise wrong_number(n_sent, n_landmarks)
-    n_bytes = 2 + -(-n_sent * n_bits // 8)
-    if len(body) != n_bytes:
-        raise InvalidRankedLandmarksError(
-            f"{n_sent} ids of {n_bits} bits are packed into {n_bytes} bytes, not {len(body)}: "
-            "is it the landmark model of another map?",
-            n_landmarks=n_landmarks,
-            bits_per_id=n_bits,
-        )
-    ids, rest = _from_bits(body[2:], n_sent, n_bits)
-    if rest.any():
-        raise InvalidRankedLandmarksError("the bits behind the last id must be zero")
+    hints = {"n_landmarks": n_landmarks, "bits_per_id": n_bits}
+    ids = _from_bits(body[2:], n_sent, n_bits, InvalidRankedLandmarksError, **hints)
     return tuple(checked_ranking(ids.tolist(), n_landmarks).tolist())
 
 
@@ -127,9 +108,20 @@ def _in_bits(numbers: NDArray[np.int64], n_bits: int) -> bytes:
     return np.packbits(bits.astype(np.uint8).reshape(-1)).tobytes()
 
 
-def _from_bits(packed: bytes, n_numbers: int, n_bits: int) -> tuple[NDArray[np.int64], NDArray[Any]]:
-    """[m] numbers back from `_in_bits`, and the bits behind the last."""
-    bits = np.unpackbits(np.frombuffer(packed, np.uint8))
+def _from_bits(
+    packed: bytes, n_numbers: int, n_bits: int, error: type[InvalidInputError], **hints: int
+) -> NDArray[np.int64]:
+    """[m] numbers back from `_in_bits`; raises `error` where that does not give these bytes."""
     n_in_all = n_numbers * n_bits
+    n_bytes = -(-n_in_all // 8)
+    if len(packed) != n_bytes:
+        raise error(
+            f"{n_numbers} numbers of {n_bits} bits are packed into {n_bytes} bytes, not {len(packed)}: "
+            "is it the landmark model of another map?",
+            **hints,
+        )
+    bits = np.unpackbits(np.frombuffer(packed, np.uint8))
+    if bits[n_in_all:].any():
+        raise error("the bits behind the last number must be zero")
     values = np.left_shift(1, np.arange(n_bits - 1, -1, -1))
-    return np.asarray(bits[:n_in_all].reshape(n_numbers, n_bits) @ values, np.int64), bits[n_in_all:]
+    return np.asarray(bits[:n_in_all].reshape(n_numbers, n_bits) @ values, np.int64)
