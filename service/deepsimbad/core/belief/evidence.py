@@ -92,16 +92,16 @@ def _news(
     Returns:
         [m] `trust` times that, less the greatest of them; and its mean size.
     """
-    news, size, by_turns = np.empty(values.size), 0.0, np.full(4, -np.inf)  # as in `_entropy_and_least`
+    news, size, times = np.empty(values.size), 0.0, trust / (1 + shared)
+    greatest = times * (values[0] - shared * last[0])
     for i in range(values.size):
-        news[i] = (values[i] - shared * last[i]) / (1 + shared)
+        news[i] = times * (values[i] - shared * last[i])
         size += abs(news[i])
     for i in range(values.size):
-        by_turns[i & 3] = max(by_turns[i & 3], news[i])
-    greatest = by_turns.max()
+        greatest = max(greatest, news[i])
     for i in range(values.size):
-        news[i] = trust * (news[i] - greatest)
-    return news, size / values.size
+        news[i] -= greatest
+    return news, size / (trust * values.size)
 
 
 @dataclass(frozen=True)

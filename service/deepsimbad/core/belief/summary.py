@@ -13,9 +13,9 @@ from deepsimbad.core.route import Route
 CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side
 DEFAULT_CONFIDENCE = 0.99
 _CREDIBLE_SHARE = 0.95
-_OCTAVES = 64  # of masses below the greatest; what is smaller is nothing
-_NOTHING = 1e-300
-_PARTS = 16  # that each octave is cut into
+_SIZES = 1024  # sixteen an octave: of masses below the greatest; what is smaller is nothing
+_TO_SIZE = 48  # bits of a double below its exponent and the four that cut an octave
+_NOTHING = np.finfo(np.float32).tiny
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class BeliefSummary:
 def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float) -> BeliefSummary:
     """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
     top, edges_m = shortlist(mass, n_top), route.histogram_edges_m
-    bits = np.log2(np.maximum(mass, _NOTHING))
+    bits = np.log2(np.maximum(mass.astype(np.float32), _NOTHING))
     mean_m, std_m, entropy_bits, ends = _figures(
         mass, bits, route.position_m, route.turn, route.length_m, edges_m[1] - edges_m[0]
     )
@@ -67,24 +67,27 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
 
 def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
     """The share of masses [n] no farther than 5 m from an image."""
-    if route.closed and route.length_m <= 2 * CONFIDENT_WITHIN_M:
+    return float(_near(mass, route.position_m, mode, route.length_m if route.closed else 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _near(mass: NDArray[np.float64], position_m: NDArray[np.float64], mode: int, turn_m: float) -> float:
+    """As `near_mode`; a turn of a closed route leads back to where it began, of an open one it is 0."""
+    if 0 < turn_m <= 2 * CONFIDENT_WITHIN_M:
         return float(mass.sum())
-    turns_m = (-route.length_m, 0.0, route.length_m) if route.closed else (0.0,)
-    at_m, near = route.position_m[mode], 0.0
-    for turn_m in turns_m:
-        window_m = (at_m + turn_m - CONFIDENT_WITHIN_M, at_m + turn_m + CONFIDENT_WITHIN_M)
-        first, last = (
-            np.searchsorted(route.position_m, window_m[0]),
-            np.searchsorted(route.position_m, window_m[1], "right"),
-        )
-        near += float(mass[first:last].sum())
-    return near
+    near = 0.0
+    for turns in range(-1, 2) if turn_m > 0 else range(1):
+        at_m = position_m[mode] + turns * turn_m
+        first = np.searchsorted(position_m, at_m - CONFIDENT_WITHIN_M)
+        last = np.searchsorted(position_m, at_m + CONFIDENT_WITHIN_M, side="right")
+        near += mass[first:last].sum()
+    return float(near)
 
 
 @njit(cache=True, nogil=True)
 def _figures(
     mass: NDArray[np.float64],
-    bits: NDArray[np.float64],
+    bits: NDArray[np.float32],
     position_m: NDArray[np.float64],
     turn: NDArray[np.float64],
     length_m: float,
@@ -123,17 +126,20 @@ def _moments(
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float64], share: float) -> tuple[float, float]:
+def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float32], share: float) -> tuple[float, float]:
     """Entropy in bits, and the least mass in the smallest set of images that holds a share.
 
-    Not all are sorted: they are summed by size, 16 classes an octave, and the class where the share is reached is.
+    Not all are sorted: they are summed by size, and the class where the share is reached is. Doubles that are not
+    negative are in the order of their patterns.
     """
-    n_classes = _OCTAVES * _PARTS
-    size_class, greatest, entropy = np.empty(mass.size, np.int16), bits.max(), 0.0
+    pattern, greatest, entropy = mass.view(np.int64), 0, 0.0
     for i in range(mass.size):
         entropy -= mass[i] * bits[i]
-        size_class[i] = int(min((greatest - bits[i]) * _PARTS, n_classes - 1.0))
-    by_turns = np.zeros((4, n_classes))  # so that an addition need not wait for the one before it
+        greatest = max(greatest, pattern[i])
+    size_class, top = np.empty(mass.size, np.int16), greatest >> _TO_SIZE
+    for i in range(mass.size):
+        size_class[i] = min(top - (pattern[i] >> _TO_SIZE), _SIZES - 1)
+    by_turns = np.zeros((4, _SIZES))  # so that an addition need not wait for the one before it
     for i in range(mass.size):
         by_turns[i & 3, size_class[i]] += mass[i]
     held = by_turns[0] + by_turns[1] + by_turns[2] + by_turns[3]
