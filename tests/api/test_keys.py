@@ -15,6 +15,7 @@ from deepsimbad.store.records import KeyScope
 from .conftest import ring_of
 
 KEY = ApiKey.new().text.encode()
+PATH = "/v1/domains"
 BEARER, BASIC, OWN = (
     (b"authorization", b"Bearer " + KEY),
     (b"authorization", b"Basic dXNlcjpwYXNz"),
@@ -58,23 +59,23 @@ def test_a_request_carries_one_key(headers, why):
 
 def test_a_ring_without_keys_is_open_until_the_first_and_closed_for_good(catalog):
     ring = ring_of(catalog)
-    assert (ring.is_open, len(ring.by_id), ring.still_opens(None)) == (True, 0, True)
+    assert (ring.needed(PATH), len(ring.by_id), ring.still_opens(None)) == (None, 0, True)
     record, key = catalog.create_key(KeyScope.LOCALIZE)
-    assert ring.is_open, "it asks the catalog now and then, not every time"
+    assert ring.needed(PATH) is None, "it asks the catalog now and then, not every time"
     asyncio.run(ring.reread())
-    assert (ring.is_open, len(ring.by_id)) == (False, 1)
+    assert (ring.needed(PATH), len(ring.by_id)) == (KeyScope.LOCALIZE, 1)
     assert ring.holder(key.text) == record
     assert ring.still_opens(record.key_id)
     assert not ring.still_opens(None), "a long answer ends that was begun while no key was asked"
     catalog.revoke_key(record.key_id)
     asyncio.run(ring.reread())
-    assert (ring.is_open, len(ring.by_id)) == (False, 1)
+    assert (ring.needed(PATH), len(ring.by_id)) == (KeyScope.LOCALIZE, 1)
     assert not ring.still_opens(record.key_id)
     with pytest.raises(UnauthorizedError, match="revoked") as caught:
         ring.holder(key.text)
     assert caught.value.hints == {"key_id": record.key_id}
     ring.load(list)
-    assert not ring.is_open
+    assert ring.needed(PATH) is KeyScope.LOCALIZE
 
 
 def test_who_shares_the_keys_is_told_of_a_change_before_it_counts_here(catalog):
@@ -115,7 +116,7 @@ def test_an_expired_key(catalog):
     time.sleep(0.01)
     with pytest.raises(UnauthorizedError, match="expired"):
         ring.holder(key.text)
-    assert (any(map(ring.still_opens, ring.by_id)), ring.is_open) == (False, False)
+    assert (any(map(ring.still_opens, ring.by_id)), ring.needed(PATH)) == (False, KeyScope.LOCALIZE)
 
 
 def test_every_key_is_compared_known_or_not(catalog, monkeypatch):
@@ -146,13 +147,14 @@ def test_a_catalog_that_cannot_be_read_lets_what_was_known_count_for_a_while(cat
     catalog.close()
     now_s = KEPT_S - 1
     asyncio.run(ring.reread())
-    assert ring.is_open != has_key
+    assert ring.needed(PATH) is (KeyScope.LOCALIZE if has_key else None)
     assert not has_key or ring.holder(key.text).scope is KeyScope.ADMIN
     now_s = KEPT_S + 1
     asyncio.run(ring.reread())
     for unread in (ring, KeyRing()):
         with pytest.raises(UnavailableError):
-            _ = unread.is_open
+            unread.needed(PATH)
+        assert unread.needed("/healthz") is None
 
 
 # Rates

@@ -12,7 +12,6 @@ from fastapi.routing import APIRoute
 from pydantic import Field
 from starlette.responses import JSONResponse
 
-from deepsimbad.api import requests
 from deepsimbad.api.frames import FrameBody
 from deepsimbad.api.problems import InvalidRequestError
 from deepsimbad.api.requests import MAX_NUMBERS, QuickRoute, parse_json
@@ -28,13 +27,13 @@ def running():
 @pytest.mark.parametrize("n_blanks", [0, 1 << 16])
 async def test_a_long_body_is_read_in_a_thread(running, n_blanks, monkeypatch):
     threads = []
-    parsed = requests._parsed
+    parsed = FrameBody.model_validate_json
 
-    def noting(body, kind):
+    def noting(body):
         threads.append(threading.get_ident())
-        return parsed(body, kind)
+        return parsed(body)
 
-    monkeypatch.setattr(requests, "_parsed", noting)
+    monkeypatch.setattr(FrameBody, "model_validate_json", noting)
     body = await parse_json(b'{"encoding":[1.5' + b" " * n_blanks + b"]}", FrameBody, running)
     assert body.encoding == (1.5,)
     assert (threads == [threading.get_ident()]) == (n_blanks == 0)

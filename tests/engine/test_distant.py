@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from deepsimbad.engine.distant import EncodedElsewhere, NetworkFacts, by_encoder, encoded
-from deepsimbad.engine.localizer import ReadyEncoding
 from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, InferenceWorker, encode_images
 from deepsimbad.errors import UnavailableError
 from deepsimbad.evaluators.base import Lesson
@@ -89,11 +88,9 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, wor
 @pytest.mark.parametrize(
     "raw", [{"kind": "feature_l2", "extractor": "none"}, {"kind": "siamese", "extractor": "gradient_grid"}]
 )
-def test_who_has_no_network_asks_nobody(beside, worker, raw):
+def test_who_has_no_network_asks_nobody(beside, raw):
     evaluator = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
     assert not isinstance(evaluator, EncodedElsewhere)
-    view = ReadyEncoding(np.zeros(4))
-    assert asyncio.run(encoded(worker, evaluator, view)) is view
 
 
 def test_an_encoder_that_is_away_is_told_and_asked_again(beside):

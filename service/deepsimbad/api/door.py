@@ -5,8 +5,8 @@ Nothing that happens behind it leaves the sender without an answer or the log wi
 
 import asyncio
 import logging
+import random
 import re
-import secrets
 import time
 from functools import lru_cache
 from urllib.parse import urlsplit
@@ -16,7 +16,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from deepsimbad.api.keys import KeyRing, RateLimit, needed_scope
+from deepsimbad.api.keys import KeyRing, RateLimit
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import error_response, unexpected_response
 from deepsimbad.api.requests import Slots
@@ -121,7 +121,12 @@ class Door:
     async def _let_in(self, scope: Scope, receive: Receive, send: Send) -> None:
         request: _Request = scope["door"]
         try:
-            request.check()
+            if not self.keys.by_id:
+                request.check_page()
+            needed = self.keys.needed(scope["path"])
+            if needed is not None:
+                self.keys.admit(scope, needed, self.rate_limit)
+            request.check_size()
         except DeepSimbadError as error:
             await error_response(scope, error)(scope, receive, send)
         else:
@@ -162,22 +167,13 @@ class _Request:
         self._headers = dict(scope["headers"])
         request_id = self._headers.get(b"x-request-id", b"")
         if not _REQUEST_ID.fullmatch(request_id):
-            request_id = secrets.token_hex(8).encode()
+            request_id = b"%016x" % random.getrandbits(64)
         scope.setdefault("state", {})["request_id"] = request_id.decode()
         self._own_headers = {b"x-request-id": request_id, **SECURITY_HEADERS}
 
-    # What the head tells
+    # What the head tells: each raises the error that the sender is answered
 
-    def check(self) -> None:
-        """Judge the head; raises the error that the sender is answered."""
-        needed, keys = needed_scope(self._scope["path"]), self._door.keys
-        if not keys.by_id:
-            self._check_page()
-        if needed is not None and not keys.is_open:
-            keys.admit(self._scope, needed, self._door.rate_limit)
-        self._check_size()
-
-    def _check_page(self) -> None:
+    def check_page(self) -> None:
         """While no key is asked, refuse what a page of another host may have sent.
 
         A page's own name may be answered by a loopback address (DNS rebinding): its Host betrays it.
@@ -193,7 +189,7 @@ class _Request:
             return
         raise ForeignHostError(f"this service asks for no key and answers its own machine alone: {what}")
 
-    def _check_size(self) -> None:
+    def check_size(self) -> None:
         """Judge how the body will come, and whether there is room for it."""
         headers = self._headers
         declared = headers.get(b"content-length", b"0").strip()
@@ -215,7 +211,8 @@ class _Request:
         if self._scope["path"] in ALWAYS_ANSWERED:
             self._was_counted = True
         elif not has_body:
-            self._count()
+            self._door.under_way.take()
+            self._was_counted, self._n_turns = True, 1
         elif n_declared > FREE_BYTES and not self._is_batch:
             # Only asked for: who announces much and sends nothing should keep nobody out.
             self._door.body_bytes.check(n_declared - FREE_BYTES)
@@ -234,7 +231,8 @@ class _Request:
                 self._door.body_bytes.take(n_more)
                 self._n_held += n_more
             if not self._was_counted and not message.get("more_body", False):
-                self._count()
+                self._door.under_way.take()
+                self._was_counted, self._n_turns = True, 1
         return message
 
     async def send(self, message: Message) -> None:
@@ -274,10 +272,6 @@ class _Request:
                 "ms": round(seconds * 1000, 2),
             }
             log.info("request", extra=line | about)
-
-    def _count(self) -> None:
-        self._door.under_way.take()
-        self._was_counted, self._n_turns = True, 1
 
     def _too_large(self, what: str) -> BodyTooLargeError:
         most = self._most_bytes

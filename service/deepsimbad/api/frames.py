@@ -3,7 +3,7 @@
 import dataclasses
 import tempfile
 from io import BytesIO
-from typing import IO, Annotated, Any, cast
+from typing import IO, Annotated, Any
 
 import numpy as np
 from anyio.to_thread import run_sync
@@ -32,6 +32,7 @@ from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import FRAME_NAME, Drive
 from deepsimbad.core.frames import MAX_POSITION_M, content_digest
 from deepsimbad.engine.decoders import Decoded
+from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.traverses import read_batch
 from deepsimbad.engine.worker import EncodedImage, Priority
@@ -172,8 +173,8 @@ async def put_frame(
         else:
             scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
         check_whole(evaluator, scene)
-        encoded = cast("EncodedImage", await running.encoded(evaluator, scene, Priority.BATCH))
-        return await run_sync(store_seen, encoded, scene.is_blank, picture)
+        seen = await encoded(running.worker, evaluator, scene, Priority.BATCH)
+        return await run_sync(store_seen, seen, scene.is_blank, picture)
 
     frame = await parse_json(body, FrameBody, running) if media_type == JSON else FrameBody()
     if "encoding" in frame.model_fields_set and len(frame.model_fields_set) == 1:

@@ -70,12 +70,19 @@ class KeyRing:
             self.by_id = {record.key_id: record for record in records}
         self._read_at = self._clock()
 
-    @property
-    def is_open(self) -> bool:
-        """Whether no key is asked; raises UnavailableError where the keys have not been known for too long."""
-        if self._clock() - self._read_at > KEPT_S:
+    def needed(self, path: str) -> KeyScope | None:
+        """The scope that a decoded path needs now; None: no key is asked.
+
+        Raises:
+            UnavailableError: One may be, but the keys have not been known for too long.
+        """
+        is_known = self._clock() - self._read_at <= KEPT_S
+        if is_known and not self.by_id:
+            return None
+        needed = needed_scope(path)
+        if needed is not None and not is_known:
             raise UnavailableError("the keys cannot be read, so nobody can be let in; try again")
-        return not self.by_id
+        return needed
 
     def still_opens(self, key_id: str | None) -> bool:
         """Whether a request let in with a key (None: while no key was asked) would be let in now; for long answers."""

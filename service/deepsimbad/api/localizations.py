@@ -265,9 +265,10 @@ def render_belief(snapshot: Map, belief: BeliefSummary, is_confident: bool) -> B
     route, ids, top = snapshot.route, belief.top, list[PlaceAnswer]()
     coordinates = []
     for metres in (route.x_m, route.y_m):
-        values = np.full(ids.size, np.nan) if metres is None else metres[ids]
-        shown = values.astype(object)
-        shown[~np.isfinite(values)] = None
+        shown = np.full(ids.size, None)
+        if metres is not None:
+            is_known = np.isfinite(metres[ids])
+            shown[is_known] = metres[ids][is_known]
         coordinates.append(shown)
     columns = (ids, snapshot.frames[ids], route.position_m[ids], *coordinates, belief.top_mass)
     for image, frame, at_m, x, y, mass in zip(*map(np.ndarray.tolist, columns), strict=True):

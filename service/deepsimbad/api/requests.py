@@ -7,19 +7,21 @@ deeply nested JSON with 400, and takes NaN.
 import hashlib
 import re
 import threading
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, cast
 
+import numpy as np
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
-from fastapi import Depends, Header, Path, Query, Request, Response, params
+from fastapi import Depends, Header, Path, Query, Request, params
 from fastapi.dependencies.utils import get_dependant, get_flat_params
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import ErrorDetails, to_json
+from starlette.types import Receive, Scope, Send
 
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
@@ -34,7 +36,7 @@ from deepsimbad.engine.pictures import Pictures
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.traverses import OpenTraverses, SpoolRoom
 from deepsimbad.engine.truths import Truths
-from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Priority
+from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
 from deepsimbad.errors import (
     EmptyBodyError,
     OverloadedError,
@@ -43,6 +45,7 @@ from deepsimbad.errors import (
     nearest_of,
 )
 from deepsimbad.evaluators.base import Evaluator
+from deepsimbad.evaluators.scenes import Scene
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.settings import Settings
 from deepsimbad.store.catalog import Catalog
@@ -158,9 +161,11 @@ class Services:
         mapped = self.maps.peek(domain)
         return mapped if mapped is not None else await run_sync(self.maps.active, domain)
 
-    async def encoded(self, evaluator: Evaluator, view: View, priority: Priority = Priority.LIVE) -> View:
+    async def encoded(self, evaluator: Evaluator, view: View) -> View:
         """An `EncodedImage` in the place of an image or a scene; other views as they are."""
-        return cast("View", await encoded(self.worker, evaluator, view, priority))
+        if isinstance(view, np.ndarray | Scene):
+            return await encoded(self.worker, evaluator, view)
+        return view
 
     async def written(self, n_listed: int, render: Callable[..., T], *given: Any) -> tuple[T, bytes]:
         """What `render` makes of what is given, and its JSON, without checking again what we computed.
@@ -219,33 +224,33 @@ class QuickRoute(APIRoute):
     is a fifth of what the event loop does for an observation.
     """
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The framework's handler, with a shorter way before it."""
-        at_length, taken = super().get_route_handler(), self.dependant
-        if taken.dependencies or taken.call is None:
-            return at_length
+    def __init__(self, *given: Any, **more: Any) -> None:
+        super().__init__(*given, **more)
+        taken = self.dependant
         fields = [*taken.path_params, *taken.query_params, *taken.header_params]
         typed: dict[str, Any] = {each.name: (each.field_info.annotation, each.field_info) for each in fields}
-        kind, answer = create_model("Parameters", **typed), taken.call
-        queries = {each.alias for each in taken.query_params}
-        headers = [(each.alias, each.alias.lower().encode()) for each in taken.header_params]
+        self._kind = None if taken.dependencies else create_model("Parameters", **typed)
+        self._queries = {each.alias for each in taken.query_params}
+        self._headers = [(each.alias, each.alias.lower().encode()) for each in taken.header_params]
 
-        async def quickly(request: Request) -> Response:
-            given: dict[str, Any] = dict(request.query_params)
-            if not given.keys() <= queries:
-                return await at_length(request)
-            given |= request.path_params
-            sent = dict(reversed(request.scope["headers"]))  # the first of several counts
-            for alias, name in headers:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The framework's, with a shorter way before it."""
+        request = Request(scope, receive, send)
+        given: dict[str, Any] = dict(request.query_params)
+        parameters: dict[str, Any] | None = None
+        if self._kind is not None and scope["method"] in (self.methods or ()) and given.keys() <= self._queries:
+            given |= scope["path_params"]
+            sent = dict(reversed(scope["headers"]))  # the first of several counts
+            for alias, name in self._headers:
                 if name in sent:
                     given[alias] = sent[name].decode("latin-1")
-            try:
-                parameters = kind.model_validate(given)
-            except ValidationError:
-                return await at_length(request)
-            return cast("Response", await answer(request=request, **vars(parameters)))
-
-        return quickly
+            with suppress(ValidationError):
+                parameters = vars(self._kind.model_validate(given))
+        if parameters is None:
+            await super().handle(scope, receive, send)
+        else:
+            response = await self.endpoint(request=request, **parameters)
+            await response(scope, receive, send)
 
 
 Running = Annotated[Services, Depends(services_of)]
@@ -413,12 +418,6 @@ async def read_json(request: Request, kind: type[Body]) -> Body:
 
 async def parse_json(body: bytes, kind: type[Body], running: Services) -> Body:
     """Check the bytes of a JSON body, those of a long one in a thread; raises InvalidRequestError."""
-    if len(body) > _LONG_BYTES:
-        return await run_sync(_parsed, body, kind, limiter=running.long_work)
-    return _parsed(body, kind)
-
-
-def _parsed(body: bytes, kind: type[Body]) -> Body:
     # All but numbers costs the parser a hundred times its bytes, and an error of its own where it is wrong: megabytes
     # of it would take seconds and gigabytes.
     if len(body) > kind.most_parts and any(body.count(mark) > kind.most_parts for mark in (b":", b'"', b"{", b"[")):
@@ -428,8 +427,11 @@ def _parsed(body: bytes, kind: type[Body]) -> Body:
     # The parser lets no other thread run until it has read all: millions of numbers would hold the event loop up.
     if body.count(b",") >= MAX_NUMBERS:
         raise invalid_body(f"more than {MAX_NUMBERS} numbers", "too_many_numbers")
+    document = body.removeprefix(_BYTE_ORDER_MARK)
     try:
-        return kind.model_validate_json(body.removeprefix(_BYTE_ORDER_MARK))
+        if len(body) > _LONG_BYTES:
+            return await run_sync(kind.model_validate_json, document, limiter=running.long_work)
+        return kind.model_validate_json(document)
     except ValidationError as error:
         raise invalid_request(
             [_with_nearest(each, kind) for each in error.errors(include_url=False)], "body"

@@ -92,10 +92,10 @@ def by_encoder(encoder: Encoder) -> Callable[[EvaluatorConfig, Compute | None], 
     return make
 
 
-async def encoded(worker: InferenceWorker, evaluator: Evaluator, view: Any, priority: Priority = Priority.LIVE) -> Any:
-    """An `EncodedImage` in the place of an image or a scene, by whoever has the network; other views as they are."""
-    if not isinstance(view, np.ndarray | Scene):
-        return view
+async def encoded(
+    worker: InferenceWorker, evaluator: Evaluator, view: Image | Scene, priority: Priority = Priority.LIVE
+) -> EncodedImage:
+    """An image or a scene, encoded by whoever has the network."""
     if isinstance(evaluator, EncodedElsewhere):
         return await asyncio.wrap_future(evaluator.encoded(view, priority))
     return await asyncio.wrap_future(worker.encode(evaluator, view, priority))

@@ -42,6 +42,7 @@ from deepsimbad.errors import (
     TooManySessionsError,
     UnknownSessionError,
 )
+from deepsimbad.evaluators.scenes import Scene
 from deepsimbad.store.records import ListPage
 from deepsimbad.store.sessions import JournalRow, ListedSession, ObservedRow, PriorRow, SessionRecord, SessionStore
 
@@ -366,7 +367,8 @@ class Sessions:
             watch.lap("wait")
             view, remarks = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
-            view = await encoded(self._worker, engine.evaluator, view)
+            if isinstance(view, np.ndarray | Scene):
+                view = await encoded(self._worker, engine.evaluator, view)
             step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch, view)
             try:
                 answer = await self._published(

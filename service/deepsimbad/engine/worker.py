@@ -317,15 +317,18 @@ class Stopwatch:
     _spent_ms: dict[str, float] = field(default_factory=dict)
 
     def lap(self, stage: str, parts_ms: Mapping[str, float] | None = None) -> None:
-        """Count the time since the last lap to a stage, but for its other parts, measured apart, to theirs."""
-        now = perf_counter()
-        parts_ms = dict(parts_ms or {})
-        parts_ms.pop(stage, None)
-        parts_ms[stage] = max(0.0, 1000 * (now - self._last) - sum(parts_ms.values()))
-        for name, spent_ms in parts_ms.items():
-            self._spent_ms[name] = round(self._spent_ms.get(name, 0.0) + spent_ms, 3)
+        """Count the time since the last lap to a stage, but that of parts, which were measured apart, to theirs."""
+        now, spent_ms = perf_counter(), self._spent_ms
+        left_ms = 1000 * (now - self._last)
+        for part, part_ms in (parts_ms or {}).items():
+            spent_ms[part] = spent_ms.get(part, 0.0) + part_ms
+            left_ms -= part_ms
+        spent_ms[stage] = spent_ms.get(stage, 0.0) + max(0.0, left_ms)
         self._last = now
 
     def timings_ms(self) -> dict[str, float]:
         """Milliseconds by stage, and their `total` up to now."""
-        return {**self._spent_ms, "total": round(1000 * (perf_counter() - self._began), 3)}
+        timings_ms = {**self._spent_ms, "total": 1000 * (perf_counter() - self._began)}
+        for stage, spent_ms in timings_ms.items():
+            timings_ms[stage] = round(spent_ms, 3)
+        return timings_ms

@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope
 
 from deepsimbad.api.door import FREE_BYTES, most_body_bytes
-from deepsimbad.api.keys import KeyRing, needed_scope, presented_key
+from deepsimbad.api.keys import KeyRing, presented_key
 from deepsimbad.api.requests import Slots
 from deepsimbad.errors import UnauthorizedError, UnavailableError
 from deepsimbad.settings import Settings
@@ -75,7 +75,7 @@ class Bodies:
     def _is_let_in(self, scope: Scope) -> bool:
         """Whether a replica would read the body of who comes with this key; it judges all that a key is for."""
         try:
-            if needed_scope(scope["path"]) is not None and not self._keys.is_open:
+            if self._keys.needed(scope["path"]) is not None:
                 self._keys.holder(presented_key(scope))
         except UnauthorizedError:
             return False

@@ -16,7 +16,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from deepsimbad.api.keys import KeyRing, check_reach, needed_scope, presented_key
+from deepsimbad.api.keys import KeyRing, check_reach, presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.server import configure_logging, http_config
 from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
@@ -226,9 +226,9 @@ class Front:
 
     def _opens(self, scope: Scope) -> bool:
         """Whether the key that is presented, if one is asked, reaches so far."""
-        needed = needed_scope(scope["path"])
         try:
-            if needed is not None and not self._keys.is_open:
+            needed = self._keys.needed(scope["path"])
+            if needed is not None:
                 check_reach(self._keys.holder(presented_key(scope)), scope["path"], needed)
         except (UnauthorizedError, ForbiddenError, UnavailableError):  # whoever is asked says so
             return False
