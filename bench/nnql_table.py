@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import ACTIONS_M, machine, markdown, real_recordings, write_page
+from bench.measurement import ACTIONS_M, machine, markdown, real_recordings
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
@@ -248,37 +248,8 @@ def report(folder: Path) -> Iterator[str]:
     with ThreadPoolExecutor(2) as pool:
         for setup in (PAPER, OURS):
             yield from setup_lines(folder, setup, pool)
-    yield from ("## What it shows", "", *CONCLUSIONS)
-
-
-CONCLUSIONS = (
-    "- **With the paper's numbers NNQL does not beat random moves under the paper's relevance and update** once the "
-    "training's own draws are averaged over; single seeds do and do not. Under our relevance and update it does, by a "
-    "little. No setting tried beats the constant move of 10 m under either: on this route far moves are simply good, "
-    "since neighbouring places look alike and a long move costs the belief nothing.",
-    "- **The training's draws matter more than most hyperparameters.** The intervals are over starts, for the one set "
-    "of values that was learnt; the line below each table says how far another seed moves a row. Rows closer to each "
-    "other than twice that are alike, and a bold figure smaller than that is no proof. So the setting that is best on "
-    "three triplets does not carry over to the other three under the paper's set-up; under ours it beats random moves "
-    "there too. (The six triplets are six orders of the same three drives, not six routes.)",
-    "- **Live images.** Learning from the very traverse that is tested comes near the best constant, and is the one "
-    "row that stands clear of the rest under the paper's set-up: what NNQL lacks is knowledge of the season to come, "
-    "more than a better learner. Landmark traverse and held-out frames do not differ by more than the seed does; the "
-    "map images themselves teach least under our set-up.",
-    "- **Exploration.** Under our set-up acting greedily while learning (0 to 0.3) is clearly worse than random moves: "
-    "entries start near 0 and values tend to 1,000, so whatever was tried first stays best. Random moves at first, and "
-    "fewer of them later, do better than random moves throughout; it is the default.",
-    "- **k.** One neighbour is too few under both; ten or thirty are no worse than four.",
-    "- **Reward and discount.** The belief ranks the truth in the top 10 % nearly always, so that reward hardly tells "
-    "moves apart. Under our set-up a stricter reward (2 %) or no discounted future at all does best, because most of a "
-    "value near 1,000 is what any move would earn.",
-    "- **Size.** 10,000 episodes of 10 moves reach each of the 6,000 entries of these maps about 66 times. On a map of "
-    "26,208 images they reach an entry 1.5 times, and a value moves a tenth of its way at each: there NNQL with the "
-    "paper's numbers has hardly begun to learn.",
-    "",
-    "The planner that ships as default acts on the whole belief instead (`informed`).",
-)
 
 
 if __name__ == "__main__":
-    write_page("nnql.md", report(real_recordings() / "nordland_netvlad64"))
+    for line in report(real_recordings() / "nordland_netvlad64"):
+        print(line, flush=True)
