@@ -8,13 +8,12 @@ import httpx2
 import pytest
 from anyio import CapacityLimiter
 from fastapi import APIRouter, FastAPI, Header, Path, Query, Request
-from fastapi.routing import APIRoute
 from pydantic import Field
 from starlette.responses import JSONResponse
 
 from deepsimbad.api.frames import FrameBody
-from deepsimbad.api.problems import InvalidRequestError
-from deepsimbad.api.requests import MAX_NUMBERS, QuickRoute, parse_json
+from deepsimbad.api.problems import InvalidRequestError, install_problem_handlers
+from deepsimbad.api.requests import MAX_NUMBERS, QuickRoute, StrictRoute, parse_json
 
 pytestmark = pytest.mark.anyio
 
@@ -72,10 +71,11 @@ async def test_a_quick_route_takes_and_refuses_what_the_framework_does(query, he
         return JSONResponse(repr([name, metres, most, word]))
 
     answers = []
-    for kind in (APIRoute, QuickRoute):
+    for kind in (StrictRoute, QuickRoute):
         app, router = FastAPI(), APIRouter(route_class=kind)
         router.get("/{name}", response_model=None)(heard)
         app.include_router(router)
+        install_problem_handlers(app)
         async with httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://robot") as robot:
             answer = await robot.get(f"/{name}?{query}", headers=headers)
         answers.append((answer.status_code, answer.json()))

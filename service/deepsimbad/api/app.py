@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi import Path as PathParameter
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import Field
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse
-from starlette.routing import Route
 
 from deepsimbad.api import (
     console,
@@ -41,7 +40,7 @@ from deepsimbad.api.door import STOPPING, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
-from deepsimbad.api.requests import Answer, Running, Services, Slots, refuse_unknown_parameters
+from deepsimbad.api.requests import Answer, Running, Services, Slots, StrictRoute
 from deepsimbad.engine.atlas import Atlas, Owners
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.events import SessionEvents
@@ -65,7 +64,7 @@ from deepsimbad.store.records import JobRecord, KeyRecord, ListPage
 from deepsimbad.store.sessions import SessionRecord, SessionStore
 from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
 
-router = APIRouter(tags=["health"])
+router = APIRouter(tags=["health"], route_class=StrictRoute)
 log = logging.getLogger(__name__)
 
 LEAST_FREE_BYTES = 16 * MEBIBYTE  # with less, the next map or the write-ahead log may not fit
@@ -135,15 +134,14 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
         version=release(),
         description=_DESCRIPTION,
         lifespan=lifespan,
-        dependencies=[Depends(refuse_unknown_parameters)],
+        routes=[route for part in _ROUTERS for route in part.routes],
         redirect_slashes=False,
         openapi_url=None,  # `install_openapi` answers it
         docs_url=None,  # the framework's page loads its script from another host
         redoc_url=None,
     )
-    for part in _ROUTERS:
-        app.include_router(part)
-    install_problem_handlers(app, [route for part in _ROUTERS for route in part.routes if isinstance(route, Route)])
+    app.router.route_class = StrictRoute
+    install_problem_handlers(app)
     install_openapi(app, settings.root_path)
     app.add_middleware(Door, settings=settings, keys=keys, metrics=metrics)
     return app

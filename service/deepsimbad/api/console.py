@@ -9,7 +9,9 @@ from fastapi import Path as PathParameter
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, RedirectResponse
 
-router = APIRouter(include_in_schema=False)
+from deepsimbad.api.requests import StrictRoute
+
+router = APIRouter(include_in_schema=False, route_class=StrictRoute)
 
 _FILES = Path(str(resources.files("deepsimbad") / "console"))
 # What is fetched, drawn and run comes from here alone; a robot's network reaches no other host.

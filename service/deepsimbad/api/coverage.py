@@ -13,11 +13,11 @@ from typing_extensions import TypedDict
 
 from deepsimbad.api.localizations import FrameName
 from deepsimbad.api.problems import problems
-from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, Running, Services
+from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, Running, Services, StrictRoute
 from deepsimbad.core.map import Map
 from deepsimbad.core.rehearsal import WITHIN_M, worst_stretches
 
-router = APIRouter(prefix="/v1/domains", tags=["domains"])
+router = APIRouter(prefix="/v1/domains", tags=["domains"], route_class=StrictRoute)
 
 PinnedVersion = Annotated[
     int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")

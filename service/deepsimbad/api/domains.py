@@ -22,6 +22,7 @@ from deepsimbad.api.requests import (
     Next,
     Page,
     Running,
+    StrictRoute,
     names,
     page_of,
     read_json,
@@ -40,8 +41,8 @@ from deepsimbad.evaluators.grey_levels import GreyLevels, levels_in
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERNS, EvaluatorKind, evaluator_config
 from deepsimbad.store.records import DomainRecord
 
-router = APIRouter(prefix="/v1/domains", tags=["domains"])
-admin = APIRouter(prefix="/v1/admin/domains", tags=["admin: domains"])
+router = APIRouter(prefix="/v1/domains", tags=["domains"], route_class=StrictRoute)
+admin = APIRouter(prefix="/v1/admin/domains", tags=["admin: domains"], route_class=StrictRoute)
 log = logging.getLogger(__name__)
 
 # Bodies and answers

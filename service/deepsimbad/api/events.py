@@ -9,13 +9,13 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from deepsimbad.api.jobs import room_for_a_stream
 from deepsimbad.api.problems import problems
-from deepsimbad.api.requests import GREATEST_ID, Running, SessionId, key_id_of, robot_of
+from deepsimbad.api.requests import GREATEST_ID, Running, SessionId, StrictRoute, key_id_of, robot_of
 from deepsimbad.api.sessions import SessionAnswer, render_observation, render_session
 from deepsimbad.engine.session import SessionView
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.store.sessions import SessionRecord
 
-router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+router = APIRouter(prefix="/v1/sessions", tags=["sessions"], route_class=StrictRoute)
 
 
 async def _session(session_id: SessionId, request: Request, running: Running) -> SessionRecord:

@@ -22,6 +22,7 @@ from deepsimbad.api.requests import (
     JsonBody,
     Running,
     Services,
+    StrictRoute,
     media_type_of,
     parse_json,
     read_bytes,
@@ -43,7 +44,9 @@ from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.evaluators.scenes import Scene, check_whole
 from deepsimbad.store.durable import storage_faults
 
-router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses/{name}/frames", tags=["admin: traverses"])
+router = APIRouter(
+    prefix="/v1/admin/domains/{domain}/traverses/{name}/frames", tags=["admin: traverses"], route_class=StrictRoute
+)
 
 FRAME_TYPES = (*MEDIA_TYPES, JSON, *TOLD_BODIES)
 _SPOOL_CHUNK_BYTES = 1 << 20

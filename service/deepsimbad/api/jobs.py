@@ -26,6 +26,7 @@ from deepsimbad.api.requests import (
     OfDomain,
     Page,
     Running,
+    StrictRoute,
     id_under_key,
     key_id_of,
     page_of,
@@ -41,8 +42,8 @@ from deepsimbad.jobs.versions import EXPERIENCE, TRAVERSE_ROLES, ExperienceConfi
 from deepsimbad.store.records import JobRecord
 from deepsimbad.store.traverses import Traverse
 
-router = APIRouter(prefix="/v1/admin/jobs", tags=["admin: jobs"])
-making = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
+router = APIRouter(prefix="/v1/admin/jobs", tags=["admin: jobs"], route_class=StrictRoute)
+making = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"], route_class=StrictRoute)
 log = logging.getLogger(__name__)
 
 JobId = Annotated[str, Path(pattern=NAME_PATTERN, description="A job's id.")]

@@ -24,6 +24,7 @@ from deepsimbad.api.requests import (
     Next,
     Page,
     Running,
+    StrictRoute,
     names,
     page_of,
     read_json,
@@ -33,7 +34,7 @@ from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionE
 from deepsimbad.store.catalog_maps import ANY, removed
 from deepsimbad.store.records import MapState
 
-router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"])
+router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"], route_class=StrictRoute)
 log = logging.getLogger(__name__)
 
 Headers = list[tuple[bytes, bytes]]

@@ -155,8 +155,8 @@ def invalid_body(what: str, kind: str = "value_error") -> InvalidRequestError:
     return InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": kind}])
 
 
-def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None:
-    """Let every error that leaves a route of `app` be answered as a problem; `Allow` is told from its `routes`."""
+def install_problem_handlers(app: FastAPI) -> None:
+    """Let every error that leaves a route of `app` be answered as a problem."""
 
     async def from_tree(request: Request, error: Any) -> Response:
         return error_response(request.scope, error)
@@ -171,7 +171,8 @@ def install_problem_handlers(app: FastAPI, routes: Sequence[Route] = ()) -> None
         headers = dict(error.headers or {})
         if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:  # the framework names those of one route
             path = request.scope["path"]
-            methods = {method for route in routes if route.path_regex.match(path) for method in route.methods or ()}
+            routes = [route for route in app.routes if isinstance(route, Route) and route.path_regex.match(path)]
+            methods = {method for route in routes for method in route.methods or ()}
             headers["Allow"] = ", ".join(sorted(methods)) or headers.get("Allow", "")
         return problem_response(request.scope, error.status_code, code, detail, headers=headers)
 

@@ -10,14 +10,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, cast
+from urllib.parse import parse_qsl
 
 import numpy as np
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import Depends, Header, Path, Query, Request, params
-from fastapi.dependencies.utils import get_dependant, get_flat_params
+from fastapi.dependencies.utils import get_flat_params
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import ErrorDetails, to_json
@@ -200,24 +200,26 @@ def prefers(request: Request, media_type: str) -> bool:
 # Parameters
 
 
-@cache
-def _query_parameters(path: str, endpoint: Callable[..., Any]) -> tuple[str, ...]:
-    taken = get_flat_params(get_dependant(path=path, call=endpoint))
-    return tuple(each.alias for each in taken if isinstance(each.field_info, params.Query))
+class StrictRoute(APIRoute):
+    """A route that refuses query parameters which it does not take; raises UnknownParameterError."""
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        super().__init__(*given, **more)
+        taken = get_flat_params(self.dependant)
+        self.queries = tuple(each.alias for each in taken if isinstance(each.field_info, params.Query))
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The framework's, after a look at the query."""
+        unknown = _query_of(scope).keys() - self.queries
+        if unknown and scope["method"] in (self.methods or ()):
+            named = sorted(name[:_LONGEST_NAME] for name in unknown)
+            what = nearest_of(named[0], self.queries) if self.queries else ": this call takes none"
+            what = f"there is no query parameter {named[0]}{what}"
+            raise UnknownParameterError(what, unknown=named[:_MOST_NAMES], allowed=list(self.queries))
+        await super().handle(scope, receive, send)
 
 
-async def refuse_unknown_parameters(request: Request) -> None:
-    """Refuse a query parameter that the route does not take, of every route; raises UnknownParameterError."""
-    route = request.scope["route"]
-    allowed = _query_parameters(route.path, route.endpoint)
-    if unknown := request.query_params.keys() - allowed:
-        named = sorted(name[:_LONGEST_NAME] for name in unknown)
-        what = nearest_of(named[0], allowed) if allowed else ": this call takes none"
-        what = f"there is no query parameter {named[0]}{what}"
-        raise UnknownParameterError(what, unknown=named[:_MOST_NAMES], allowed=list(allowed))
-
-
-class QuickRoute(APIRoute):
+class QuickRoute(StrictRoute):
     """A route whose parameters are read by one validator; what that does not take the framework refuses, by name.
 
     Of routes that depend on nothing and answer by a response of their own. The framework's way, a parameter at a time,
@@ -230,15 +232,12 @@ class QuickRoute(APIRoute):
         fields = [*taken.path_params, *taken.query_params, *taken.header_params]
         typed: dict[str, Any] = {each.name: (each.field_info.annotation, each.field_info) for each in fields}
         self._kind = None if taken.dependencies else create_model("Parameters", **typed)
-        self._queries = {each.alias for each in taken.query_params}
         self._headers = [(each.alias, each.alias.lower().encode()) for each in taken.header_params]
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The framework's, with a shorter way before it."""
-        request = Request(scope, receive, send)
-        given: dict[str, Any] = dict(request.query_params)
-        parameters: dict[str, Any] | None = None
-        if self._kind is not None and scope["method"] in (self.methods or ()) and given.keys() <= self._queries:
+        given, parameters = _query_of(scope), None
+        if self._kind is not None and scope["method"] in (self.methods or ()) and given.keys() <= {*self.queries}:
             given |= scope["path_params"]
             sent = dict(reversed(scope["headers"]))  # the first of several counts
             for alias, name in self._headers:
@@ -249,8 +248,13 @@ class QuickRoute(APIRoute):
         if parameters is None:
             await super().handle(scope, receive, send)
         else:
-            response = await self.endpoint(request=request, **parameters)
+            response = await self.endpoint(request=Request(scope, receive, send), **parameters)
             await response(scope, receive, send)
+
+
+def _query_of(scope: Scope) -> dict[str, Any]:
+    """The query's parameters; the last of several of one name counts."""
+    return dict(parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
 
 
 Running = Annotated[Services, Depends(services_of)]

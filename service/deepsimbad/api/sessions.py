@@ -45,6 +45,7 @@ from deepsimbad.api.requests import (
     Running,
     Services,
     SessionId,
+    StrictRoute,
     id_under_key,
     idempotency_header,
     insisted_on,
@@ -66,7 +67,7 @@ from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
 router = APIRouter(prefix="/v1", tags=["sessions"], route_class=QuickRoute)
-listing = APIRouter(prefix="/v1/admin/sessions", tags=["admin: sessions"])
+listing = APIRouter(prefix="/v1/admin/sessions", tags=["admin: sessions"], route_class=StrictRoute)
 
 MAX_OBSERVATIONS_FED_BACK = 100_000
 

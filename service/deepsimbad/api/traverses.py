@@ -19,6 +19,7 @@ from deepsimbad.api.requests import (
     Next,
     Page,
     Running,
+    StrictRoute,
     page_of,
     read_json,
 )
@@ -32,7 +33,7 @@ from deepsimbad.jobs.versions import TRAVERSE_ROLES
 from deepsimbad.store.records import ListPage
 from deepsimbad.store.traverses import Traverse
 
-router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"])
+router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"], route_class=StrictRoute)
 log = logging.getLogger(__name__)
 
 TraverseName = Annotated[str, Path(alias="name", pattern=NAME_PATTERN, description="A traverse's name.")]

@@ -33,6 +33,7 @@ from deepsimbad.api.requests import (
     Name,
     Running,
     Services,
+    StrictRoute,
     insisted_on,
     media_type_of,
     parse_json,
@@ -52,7 +53,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import levels_in
 
-router = APIRouter(prefix="/v1", tags=["localization"])
+router = APIRouter(prefix="/v1", tags=["localization"], route_class=StrictRoute)
 
 ALL = "*"
 MOST_NAMES = 10_000
