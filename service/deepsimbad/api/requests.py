@@ -210,7 +210,7 @@ class StrictRoute(APIRoute):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The framework's, after a look at the query."""
-        unknown = _query_of(scope).keys() - self.queries
+        unknown = Request(scope).query_params.keys() - self.queries
         if unknown and scope["method"] in (self.methods or ()):
             named = sorted(name[:_LONGEST_NAME] for name in unknown)
             what = nearest_of(named[0], self.queries) if self.queries else ": this call takes none"
@@ -236,8 +236,9 @@ class QuickRoute(StrictRoute):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The framework's, with a shorter way before it."""
-        given, parameters = _query_of(scope), None
-        if self._kind is not None and scope["method"] in (self.methods or ()) and given.keys() <= {*self.queries}:
+        given = dict[str, Any](parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
+        parameters: dict[str, Any] | None = None
+        if self._kind is not None and scope["method"] in (self.methods or ()) and not given.keys() - self.queries:
             given |= scope["path_params"]
             sent = dict(reversed(scope["headers"]))  # the first of several counts
             for alias, name in self._headers:
@@ -250,11 +251,6 @@ class QuickRoute(StrictRoute):
         else:
             response = await self.endpoint(request=Request(scope, receive, send), **parameters)
             await response(scope, receive, send)
-
-
-def _query_of(scope: Scope) -> dict[str, Any]:
-    """The query's parameters; the last of several of one name counts."""
-    return dict(parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
 
 
 Running = Annotated[Services, Depends(services_of)]
