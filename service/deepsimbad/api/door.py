@@ -8,6 +8,7 @@ import logging
 import random
 import re
 import time
+from collections.abc import Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
 
@@ -163,8 +164,8 @@ class _Request:
         self._was_counted = False
         self._n_turns = 0  # that it has, of those who are under way
         self._n_bytes = self._n_held = 0  # of the body, so far
-        self._most_bytes, self._is_batch = most_body_bytes(scope, door.settings)
         self._headers = dict(scope["headers"])
+        self._most_bytes, self._is_batch = most_body_bytes(scope, self._headers, door.settings)
         request_id = self._headers.get(b"x-request-id", b"")
         if not _REQUEST_ID.fullmatch(request_id):
             request_id = b"%016x" % random.getrandbits(64)
@@ -278,11 +279,11 @@ class _Request:
         return BodyTooLargeError(f"{what}; at most {most} are taken here, send less at once", max_bytes=most)
 
 
-def most_body_bytes(scope: Scope, settings: Settings) -> tuple[int, bool]:
+def most_body_bytes(scope: Scope, headers: Mapping[bytes, bytes], settings: Settings) -> tuple[int, bool]:
     """How long the body of a request may be, and whether it is a batch, which goes to the disk as it comes."""
     if scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]) is not None:
         return settings.max_batch_bytes, True
-    is_image = dict(scope["headers"]).get(b"content-type", b"").lower().startswith(b"image/")
+    is_image = headers.get(b"content-type", b"").lower().startswith(b"image/")
     return settings.max_image_bytes if is_image else settings.max_json_bytes, False
 
 

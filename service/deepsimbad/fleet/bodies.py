@@ -40,8 +40,9 @@ class Bodies:
             UnavailableError: Nor on the disk.
             ClientDisconnect: Its sender has gone before all of it had come.
         """
-        most, is_batch = most_body_bytes(scope, self._settings)
-        declared = dict(scope["headers"]).get(b"content-length", b"0")
+        headers = dict(scope["headers"])
+        most, is_batch = most_body_bytes(scope, headers, self._settings)
+        declared = headers.get(b"content-length", b"0")
         n_declared = int(declared[:20]) if declared.isdigit() else 0
         parts = _parts(scope, receive, most)
         if n_declared > most or not self._is_let_in(scope):
