@@ -25,6 +25,12 @@ class Places:
     of_image: NDArray[np.intp]
     n_images: NDArray[np.intp]
 
+    def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[n] values of images; those of one place have the mean of theirs."""
+        if self.position_m.size == values.size:
+            return values
+        return np.asarray((np.bincount(self.of_image, values) / self.n_images)[self.of_image])
+
 
 @dataclass(frozen=True)
 class Route:

@@ -1,5 +1,7 @@
 """The exact filter and the paper's against their definitions: moves, views, the lost state, trust in views."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -328,7 +330,7 @@ def test_a_robot_that_was_carried_is_found_again(kind, route):
         if 5 <= step <= 13:
             found.append(abs(int(belief.mass.argmax()) - at) <= 2)
             doubted = max(doubted, belief.off_route)
-    assert doubted > 0.2
+    assert doubted > 0.1
     assert sum(found[:6]) >= 3
     assert all(found[4:])
 
@@ -352,19 +354,29 @@ def test_a_robot_off_the_route_is_called_lost_and_one_on_it_is_not(route):
 # --- particles -----------------------------------------------------------------------------------------------------
 
 
+def in_finer_cells(route, factor):
+    """The route, with so many cells where it has one."""
+    usual, finer = route.cells, Route(route.position_m, route.closed)
+    n_cells = usual.n_cells * factor - (0 if route.closed else factor - 1)
+    finer.__dict__["cells"] = replace(usual, step_m=usual.step_m / factor, n_cells=n_cells)
+    return finer
+
+
 # Added evidence counts at every place of a grid, but only where there are particles: on an open route none are left
-# behind the last move, so the additive rules are compared on a loop.
+# behind the last move, so the additive rules are compared on a loop. Theirs count for the nearest image, as in the
+# paper, and so do cells that are the images; the others come near what cells come near as they get shorter.
 @pytest.mark.parametrize(
     ("rule", "closed"),
     [*((rule, True) for rule in UpdateRule), (UpdateRule.LOG_LIKELIHOOD, False), (UpdateRule.MIXTURE, False)],
 )
 def test_particles_come_near_the_exact_filter_as_they_grow(rule, closed):
     route = Route(np.arange(60.0), closed)
+    exact_route = route if rule in ADDITIVE else in_finer_cells(route, 8)
     views = np.random.default_rng(1).normal(size=(4, 60)) * 2
     moves = (3.0, 7.0, 2.0)
     apart = []
     for n_particles in (300, 30_000):
-        exact, sampled = GridFilter.uniform(route, rule), ParticleFilter.uniform(route, n_particles, 3, rule)
+        exact, sampled = GridFilter.uniform(exact_route, rule), ParticleFilter.uniform(route, n_particles, 3, rule)
         for step, view in enumerate(views):
             if step:
                 exact = exact.predicted(moves[step - 1], 1.0, step)
@@ -372,9 +384,22 @@ def test_particles_come_near_the_exact_filter_as_they_grow(rule, closed):
             said = seen(view, rule, shared=0.5 if step else 0.0)
             exact, sampled = exact.updated(said, step), sampled.updated(said, step)
         apart.append(np.abs(exact.mass - sampled.mass).sum() / 2)
-    assert apart[1] < 0.12
-    assert apart[1] < apart[0] / 2
-    assert sampled.off_route == pytest.approx(exact.off_route, abs=0.03)
+    assert apart[1] < 0.04
+    assert apart[1] < apart[0] / 3
+    assert sampled.off_route == pytest.approx(exact.off_route, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", list(FilterKind))
+def test_a_view_is_heard_of_between_images_as_the_way_leads_to_the_other(kind):
+    """Images of one stop say what they say on average."""
+    route = Route(np.array([0.0, 0.0, 8.0, 16.0]))
+    belief = FILTERS[kind].uniform(in_finer_cells(route, 64)).updated(seen([3.0, 5.0, 0.0, 0.0]), 0)
+    expected, on_the_way = 0.0, 4 * (1 - np.arange(0.5, 512) / 512)  # from one place to the next
+    for trust, probable in ((0.5, 0.2), (1.0, 0.4), (2.0, 0.4)):
+        likelihood = np.exp(trust * on_the_way)
+        mass = np.array([likelihood[:256].sum() / 2] * 2 + [likelihood[256:].sum() + 256, 256])
+        expected = expected + probable * mass / mass.sum()
+    np.testing.assert_allclose(belief.mass, expected, atol=0.005)
 
 
 def test_the_same_seed_and_steps_give_the_same_bits():
@@ -389,6 +414,11 @@ def test_the_same_seed_and_steps_give_the_same_bits():
     first, again, other = run(5, restore=False), run(5, restore=True), run(6, restore=False)
     assert all(first[name].tobytes() == again[name].tobytes() for name in first)
     assert first["position_m"].tobytes() != other["position_m"].tobytes()
+
+
+def test_no_place_has_less_than_nothing():
+    belief = ParticleFilter.around(Route(np.arange(150.0)), 59.0, 2.0, seed=1)
+    assert belief.updated(seen(3 * np.cos(np.arange(150.0))), 0).mass.min() == 0
 
 
 def test_particles_past_the_end_of_an_open_route_die():

@@ -19,6 +19,8 @@ DEFAULT_N_PARTICLES = 1000
 _LEAST_PLACED = 4  # particles where a robot that was lost may be
 _NEGLIGIBLE = 1e-3  # of the belief; particles that hold no more are given up without drawing all anew
 _EVENNESS = 0.5  # the power of its weight by which a particle is drawn: unlikely places keep some, of less weight each
+_NOTHING = 1e-300  # of a likelihood or a weight: less is no less
+_LEVEL = 1e-6  # of a logarithm's rise: the likelihood is the same all the way
 _START, _RETURN, _MOVE, _RESAMPLE = range(4)  # what a draw is for; part of its seed
 
 
@@ -57,7 +59,7 @@ class ParticleFilter:
         seed: int = 0,
         rule: UpdateRule = UpdateRule.MIXTURE,
     ) -> Self:
-        """Particles drawn around a position; beyond the ends of an open route they stand at the end."""
+        """Particles drawn around a position; none is beyond the ends of an open route."""
         rng = np.random.default_rng([seed, 0, _START])
         drawn = position_m + std_m * rng.standard_normal(n_particles)
         return cls._equal(route, _onto(route, drawn), seed, rule, LOST_AT_FIX)
@@ -88,7 +90,7 @@ class ParticleFilter:
         else:  # the paper's count for the image nearest to them
             mass = np.bincount(route.nearest_image(self.position_m), together, route.n_images).astype(np.float64)
         mass = mass + (trust @ self.found) * route.cell_m / route.cell_m.sum()
-        return np.asarray(mass / max(mass.sum(), 1e-300), np.float64)
+        return np.asarray(mass / max(mass.sum(), _NOTHING), np.float64)
 
     @property
     def off_route(self) -> float:
@@ -109,6 +111,7 @@ class ParticleFilter:
             weights = np.where(past_m > (reach_m if self.doubt.is_mixture else 1e-9), 0.0, weights)
             if not weights.any():  # it may still have stopped at the end
                 weights = np.where(past_m > reach_m, 0.0, before.weights)
+            target_m = np.clip(target_m, route.start_m, route.position_m[-1])
         on_route, surviving = before.weights.sum(axis=1), weights.sum(axis=1)
         if step == 1 or not self.doubt.is_mixture:  # later it may have been carried, if no particle is where that is
             check_ahead(route, self.doubt, on_route, surviving, action_m)
@@ -126,47 +129,57 @@ class ParticleFilter:
 
     def updated(self, seen: ViewEvidence, step: int) -> Self:
         """As `GridFilter.updated`; the paper's particles are drawn anew at once where their weights ask for it."""
-        images = self.route.nearest_image(self.position_m)
         trust, least_told = self.doubt.trust, 0.0
         if seen.is_added:
-            on_route = 1 - self.doubt.lost
+            images, on_route = self.route.nearest_image(self.position_m), 1 - self.doubt.lost
             weights = np.outer(on_route, added(trust @ self.weights / on_route.mean(), seen.values[images]))
             weighed = replace(self, weights=weights, found=np.zeros_like(self.found))
             after = weighed if self.doubt.is_mixture else weighed._evened_out(step)
         else:
-            least, least_told = seen.likelihood(seen.values, self.doubt.last)
-            average = _averages(least, trust.size)
+            values = self.route.places.means(seen.values)
+            likelihood, least_told = seen.likelihood(values, self.doubt.last)
+            way = _Way.of(self.route, likelihood)
+            ends_m = np.array([self.route.start_m, self.route.start_m + self.route.length_m])
+            average = way.means(ends_m[:1], ends_m[1:], trust.size)[:, 0]
             weights, found, lost = (
-                self.weights * _by_trust(least[images], trust.size),
+                self.weights * self._likelihoods(way),
                 self.found * average,
                 self.doubt.lost * average,
             )
             total = weights.sum(axis=1) + found + lost
             if (total <= 0).any():  # the view allows nothing that is still believed: what was known stays
                 return replace(self, told=0.0)
-            doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), seen.values)
+            doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), values)
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
-            after = weighed._placed(least, step) if doubt.is_mixture else weighed._evened_out(step)
+            after = weighed._placed(way, step) if doubt.is_mixture else weighed._evened_out(step)
         moved = 0.5 * float(np.abs(weighed._believed - self._believed).sum())
         return replace(after, told=max(moved, least_told))
+
+    def _likelihoods(self, way: "_Way") -> NDArray[np.float64]:
+        """[t, m] of the particles, by trust: on average over the stretches that they stand for, where they do."""
+        if not self.doubt.is_mixture:
+            return way.at(self.position_m)[np.newaxis]
+        order, likelihoods = np.argsort(self.position_m, kind="stable"), np.empty_like(self.weights)
+        likelihoods[:, order] = way.means(*_stretches(self.route, self.position_m[order]), self.doubt.trust.size)
+        return likelihoods
 
     @property
     def _believed(self) -> NDArray[np.float64]:
         """[m + 1] of the particles and of what was found, if the robot is on the route; sums to 1."""
         believed = np.append(self.doubt.trust @ self.weights, self.doubt.trust @ self.found)
-        return np.asarray(believed / max(believed.sum(), 1e-300))
+        return np.asarray(believed / max(believed.sum(), _NOTHING))
 
     def _evened_out(self, step: int) -> Self:
         """Resampled where the effective sample size has fallen below half the particles."""
         together = self.doubt.trust @ self.weights
-        effective = np.square(together.sum()) / max(np.square(together).sum(), 1e-300)
+        effective = np.square(together.sum()) / max(np.square(together).sum(), _NOTHING)
         return self if effective >= together.size / 2 else self._resampled(step)
 
-    def _placed(self, least: NDArray[np.float64], step: int) -> Self:
+    def _placed(self, way: "_Way", step: int) -> Self:
         """What was found gets particles where the view says it may be, a few at least, in place of the lightest.
 
         Args:
-            least: [n] likelihood of the least trust.
+            way: What the view says along the route.
             step: Number of this step in the session.
         """
         trust, m = self.doubt.trust, self.position_m.size
@@ -176,8 +189,8 @@ class ParticleFilter:
         if n_placed == 0:
             return replace(self, doubt=replace(self.doubt, lost=self.doubt.lost + self.found), found=0 * self.found)
         rng = np.random.default_rng([self.seed, step, _RETURN])
-        cumulated = _cumulated(least, self.route.cell_m, trust * self.found)
-        images = _comb(cumulated, n_placed, rng.random())
+        cumulated = _cumulated(way.likelihood[: self.route.n_images], self.route.cell_m, trust * self.found)
+        images, _ = _comb(cumulated, n_placed, rng.random())
         together = trust @ self.weights
         heaviest = np.argsort(together, kind="stable")[n_placed:]
         if together[heaviest].sum() >= (1 - _NEGLIGIBLE) * together.sum():
@@ -185,10 +198,11 @@ class ParticleFilter:
         else:
             kept = self._resampled(step, m - n_placed)
         half_m = self.route.cell_m[images] * (rng.random(n_placed) - 0.5)
-        position_m = np.concatenate([kept.position_m, _onto(self.route, self.route.position_m[images] + half_m)])
+        placed_m = _onto(self.route, self.route.position_m[images] + half_m)
         density = cumulated[images] - np.where(images > 0, cumulated[images - 1], 0.0)
-        placed = _by_trust(least[images], trust.size) * self.route.cell_m[images] / density
-        placed *= (self.found / np.maximum(placed.sum(axis=1), 1e-300))[:, np.newaxis]
+        placed = _by_trust(way.at(placed_m), trust.size) * self.route.cell_m[images] / density
+        placed *= (self.found / np.maximum(placed.sum(axis=1), _NOTHING))[:, np.newaxis]
+        position_m = np.concatenate([kept.position_m, placed_m])
         weights = np.concatenate([kept.weights, placed], axis=1)
         return replace(self, position_m=position_m, weights=weights, found=np.zeros_like(self.found))
 
@@ -207,18 +221,18 @@ class ParticleFilter:
         drawn_by = together**_EVENNESS if self.doubt.is_mixture else together
         if self.doubt.is_mixture:
             order = np.argsort(self.position_m, kind="stable")
-            chosen = _comb(np.cumsum(drawn_by[order]), n, rng.random())
+            chosen, part = _comb(np.cumsum(drawn_by[order]), n, rng.random())
             low_m, high_m = _stretches(self.route, self.position_m[order])
-            position_m = low_m[chosen] + rng.random(n) * (high_m - low_m)[chosen]
+            position_m = low_m[chosen] + part * (high_m - low_m)[chosen]
             chosen = order[chosen]
         else:
-            chosen = _comb(np.cumsum(drawn_by), n, rng.random())
+            chosen, _ = _comb(np.cumsum(drawn_by), n, rng.random())
             position_m = self.position_m[chosen]
         return self._of(position_m, np.ascontiguousarray(self.weights[:, chosen]) / drawn_by[chosen])
 
     def _of(self, position_m: NDArray[np.float64], weights: NDArray[np.float64]) -> Self:
         """Other particles, with as much of every trust's belief on the route as these have."""
-        total = np.maximum(weights.sum(axis=1), 1e-300)
+        total = np.maximum(weights.sum(axis=1), _NOTHING)
         return replace(self, position_m=position_m, weights=weights * (self.weights.sum(axis=1) / total)[:, np.newaxis])
 
 
@@ -230,16 +244,72 @@ def _by_trust(least: NDArray[np.float64], n_trusts: int) -> NDArray[np.float64]:
     return np.array(rows)
 
 
+@dataclass(frozen=True)
+class _Way:
+    """How likely a view is along the route: between two images its logarithm leads from one to the other."""
+
+    at_m: NDArray[np.float64]  # [w] of the images; a closed route goes on to its first one
+    likelihood: NDArray[np.float64]  # [w] of the least trust
+    log: NDArray[np.float64]  # [w]
+
+    @classmethod
+    def of(cls, route: Route, least: NDArray[np.float64]) -> Self:
+        """Of the likelihoods of images [n], alike where they show one place."""
+        at_m = route.position_m
+        if route.closed:
+            at_m, least = np.append(at_m, route.start_m + route.length_m), np.append(least, least[0])
+        return cls(at_m, least, np.log(np.maximum(least, _NOTHING)))
+
+    def at(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[m] at positions on the route."""
+        return np.asarray(np.exp(np.interp(position_m, self.at_m, self.log)), np.float64)
+
+    def means(self, low_m: NDArray[np.float64], high_m: NDArray[np.float64], n_trusts: int) -> NDArray[np.float64]:
+        """[t, s] of stretches that do not overlap, in order, by trust."""
+        return _means(self.at_m, self.likelihood, self.log, low_m, high_m, n_trusts)
+
+
 @njit(cache=True, nogil=True)
-def _averages(least: NDArray[np.float64], n_trusts: int) -> NDArray[np.float64]:
-    """[t] of the likelihoods [n], by trust."""
-    sums = np.zeros(n_trusts)
-    for image in range(least.size):
-        likelihood = least[image]
-        for t in range(n_trusts):
-            sums[t] += likelihood
-            likelihood *= likelihood
-    return sums / least.size
+def _means(
+    at_m: NDArray[np.float64],
+    likelihood: NDArray[np.float64],
+    log: NDArray[np.float64],
+    low_m: NDArray[np.float64],
+    high_m: NDArray[np.float64],
+    n_trusts: int,
+) -> NDArray[np.float64]:
+    """[t, s] of likelihoods whose logarithm is linear between positions [w]; without length, what is there."""
+    means, last, part = np.zeros((n_trusts, low_m.size)), at_m.size - 1, 0
+    for stretch in range(low_m.size):
+        from_m, end_m = low_m[stretch], high_m[stretch]
+        while part + 1 < last and at_m[part + 1] <= from_m:
+            part += 1
+        from_log = _log_at(from_m, at_m, log, part)
+        before, length_m = np.exp(from_log), end_m - from_m
+        for t in range(n_trusts if length_m <= 0 else 0):
+            means[t, stretch] = before ** (1 << t)
+        while from_m < end_m:  # the pieces between two positions each
+            to_m, to_log, after = end_m, 0.0, 0.0
+            if part + 1 == last or end_m < at_m[part + 1]:
+                to_log = _log_at(end_m, at_m, log, part)
+                after = np.exp(to_log)
+            else:
+                to_m, to_log, after = at_m[part + 1], log[part + 1], likelihood[part + 1]
+                part += 1
+            low, high, rise, share = before, after, to_log - from_log, (to_m - from_m) / length_m
+            for t in range(n_trusts):
+                means[t, stretch] += share * ((high - low) / rise if abs(rise) > _LEVEL else high)
+                low, high, rise = low * low, high * high, 2 * rise
+            from_m, from_log, before = to_m, to_log, after
+    return means
+
+
+@njit(cache=True, nogil=True)
+def _log_at(metres: float, at_m: NDArray[np.float64], log: NDArray[np.float64], part: int) -> float:
+    """What is linear from one position to the next, where the next is farther."""
+    if metres <= at_m[part]:
+        return float(log[part])
+    return float(log[part] + (log[part + 1] - log[part]) * (metres - at_m[part]) / (at_m[part + 1] - at_m[part]))
 
 
 @njit(cache=True, nogil=True)
@@ -263,10 +333,13 @@ def _cumulated(
     return cumulated
 
 
-def _comb(cumulated: NDArray[np.float64], count: int, offset: float) -> NDArray[np.intp]:
-    """[count] ids, each as often as its weight asks for."""
-    chosen = np.searchsorted(cumulated, cumulated[-1] * (np.arange(count) + offset) / count, side="right")
-    return np.asarray(np.minimum(chosen, cumulated.size - 1), np.intp)
+def _comb(cumulated: NDArray[np.float64], count: int, offset: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """[count] ids, each as often as its weight asks for, and how far in each its tooth stands, 0 to 1."""
+    teeth = cumulated[-1] * (np.arange(count) + offset) / count
+    chosen = np.minimum(np.searchsorted(cumulated, teeth, side="right"), cumulated.size - 1)
+    before = np.where(chosen > 0, cumulated[chosen - 1], 0.0)
+    part = (teeth - before) / np.maximum(cumulated[chosen] - before, _NOTHING)
+    return np.asarray(chosen, np.intp), np.asarray(np.clip(part, 0, 1), np.float64)
 
 
 def _stretches(route: Route, position_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -291,7 +364,7 @@ def _on_images(
     if route.closed:  # behind the last image the first may be nearer
         middle_m = np.append(middle_m, (places.position_m[-1] + last_m) / 2)
     below = _below(middle_m, low_m, high_m, weight)
-    mass = np.diff(below, prepend=0.0, append=weight.sum())
+    mass = np.maximum(np.diff(below, prepend=0.0, append=weight.sum()), 0.0)  # sums round otherwise than a sum of parts
     if route.closed:
         mass = np.concatenate([mass[:1] + mass[-1:], mass[1:-1]])
     return mass if mass.size == route.n_images else np.asarray(mass[places.of_image] / places.n_images[places.of_image])
@@ -314,10 +387,12 @@ def _below(
 
 
 def _onto(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions on the route: round a closed one, to the ends of an open one."""
+    """Positions on the route: round a closed one, turned back at the ends of an open one."""
     if route.closed and route.length_m > 0:
         return route.wrapped(position_m)
-    return np.clip(position_m, route.start_m, route.position_m[-1])
+    start_m, end_m = route.start_m, route.position_m[-1]
+    turned_m = end_m - np.abs(end_m - start_m - np.abs(position_m - start_m))
+    return np.asarray(np.clip(turned_m, start_m, end_m), np.float64)
 
 
 class FilterKind(StrEnum):

@@ -2,7 +2,7 @@
 
 On equal cells a move is a shift and its error one short row of weights, the same everywhere. There are about as many
 cells as map images; where the images stand at equal distances the cells are the images, and the beliefs those of
-`GridFilter`. Else a cell takes the evidence of the image nearest to it, as a particle there would.
+`GridFilter`. Else a cell takes the evidence of the image nearest to it, as the paper's particles do.
 """
 
 from collections.abc import Sequence
