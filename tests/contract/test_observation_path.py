@@ -10,7 +10,7 @@ import deepsimbad
 
 from .conftest import RANKS, service
 
-MOST_FILES, MOST_FUNCTIONS = 26, 121
+MOST_FILES, MOST_FUNCTIONS = 25, 116
 PROJECT = str(Path(deepsimbad.__file__).parent)
 
 
