@@ -219,13 +219,14 @@ def render_localization(
 ) -> LocalizationAnswer:
     """The answer to one view, with remarks on its picture; the watch runs since the request arrived."""
     snapshot, relevance = localization.snapshot, localization.relevance
+    is_confident = localization.belief.near_mode >= DEFAULT_CONFIDENCE
     return {
         "map_version": snapshot.version,
-        "belief": render_belief(snapshot, localization.belief, localization.belief.near_mode >= DEFAULT_CONFIDENCE),
+        "belief": render_belief(snapshot, localization.belief, is_confident),
         "informative": localization.is_informative,
         "warnings": [*remarks, *warnings_of(localization.is_informative, localization.belief)],
         "retrieval": render_shortlist(snapshot, localization.shortlist, relevance),
-        "next_best_view": render_plan(localization.plan, snapshot.actions_m),
+        "next_best_view": render_plan(localization.plan, snapshot.actions_m, is_confident),
         "timings_ms": watch.timings_ms(),
     }
 
@@ -239,8 +240,8 @@ def render_shortlist(snapshot: Map, ids: NDArray[np.int64], relevance: NDArray[n
     return rows
 
 
-def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestViewAnswer | None:
-    """A recommended move; None where there is none."""
+def render_plan(plan: Plan | None, actions_m: NDArray[np.float64], is_confident: bool) -> NextBestViewAnswer | None:
+    """A recommended move, or to stop where the robot is sure of its place; None where there is none."""
     if plan is None:
         return None
     unknown = [None] * actions_m.size
@@ -249,7 +250,7 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64]) -> NextBestVi
     actions: list[ActionAnswer] = []
     for action_m, value, expected in zip(actions_m.tolist(), values, bits, strict=True):
         actions.append({"action_m": action_m, "q_value": value, "expected_bits": expected})
-    return {"planner": plan.planner, "action_m": plan.action_m, "stop": plan.stop, "actions": actions}
+    return {"planner": plan.planner, "action_m": plan.action_m, "stop": is_confident, "actions": actions}
 
 
 def warnings_of(is_informative: bool, belief: BeliefSummary) -> list[str]:

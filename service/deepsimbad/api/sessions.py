@@ -210,7 +210,7 @@ def render_session(view: SessionView) -> SessionAnswer:
         "n_observations": view.n_observations,
         "expires_at": _iso(view.expires_at),
         "belief": render_belief(snapshot, view.belief, view.is_confident),
-        "next_best_view": render_plan(view.plan, snapshot.actions_m),
+        "next_best_view": render_plan(view.plan, snapshot.actions_m, view.is_confident),
     }
 
 
@@ -358,8 +358,8 @@ async def get_belief(
 @router.get("/sessions/{session_id}/next-best-view", responses=problems(404, 410, 422))
 async def get_next_best_view(session_id: SessionId, request: Request, running: Running) -> NextBestViewAnswer | None:
     """The move that would tell most, without a new view; null where the map can name none."""
-    plan, actions_m = await running.sessions.next_best_view(session_id, robot_of(request))
-    return render_plan(plan, actions_m)
+    view = await running.sessions.view(session_id, key_id=robot_of(request))
+    return render_plan(view.plan, view.snapshot.actions_m, view.is_confident)
 
 
 @router.put(

@@ -14,7 +14,6 @@ from deepsimbad.core.belief.evidence import ViewEvidence
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.motion import SIGMAS, motion_std_m
 from deepsimbad.core.belief.particles import DEFAULT_N_PARTICLES, BeliefFilter, FilterKind, ParticleFilter
-from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, near_mode
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
@@ -34,7 +33,6 @@ class LocalizerConfig:
     seed: int = 0  # of whatever is random
     n_particles: int = DEFAULT_N_PARTICLES  # of the particle filter
     price_bits_per_m: float = 0.0  # of moving, to the planner
-    confidence: float = DEFAULT_CONFIDENCE  # of the mass near the mode, from which on the robot may stop
 
 
 @dataclass(frozen=True)
@@ -117,8 +115,7 @@ class ActiveLocalizer:
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The next best view from what is known now."""
-        belief = state.belief
-        plan = self._planner(
+        return self._planner(
             PlanningView(
                 self._map,
                 state.belief.mass,
@@ -128,10 +125,6 @@ class ActiveLocalizer:
                 self._config.price_bits_per_m,
             )
         )
-        if plan is None:
-            return None
-        sure = near_mode(self._map.route, belief.mass, int(belief.mass.argmax())) * (1 - belief.off_route)
-        return replace(plan, stop=sure >= self._config.confidence)
 
     def with_prior(self, state: LocalizerState, position_m: float, std_m: float) -> LocalizerState:
         """The robot was carried, or got a fix: a new belief; what is usual for each landmark stays."""

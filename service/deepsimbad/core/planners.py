@@ -44,7 +44,6 @@ class Plan:
     action_m: float  # the move
     # [a] what the planner thought of every move, larger is better; None where it did not compare
     values: NDArray[np.float64] | None = None
-    stop: bool = False  # whether the robot is as sure of its place as it asked to be
     bits: NDArray[np.float64] | None = (
         None  # [a] that the view after every move is expected to tell; None: nobody knows
     )

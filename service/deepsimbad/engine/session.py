@@ -135,7 +135,6 @@ class SessionEngine:
             planner=config.planner,
             seed=config.seed,
             price_bits_per_m=config.price_bits_per_m,
-            confidence=config.confidence,
         )
         return ActiveLocalizer(self.snapshot, algorithm, perf_counter)
 

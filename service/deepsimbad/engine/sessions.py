@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.planners import Plan
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.localizer import View, describe, is_short
@@ -173,16 +172,6 @@ class Sessions:
         """[n] mass of every map image in a session's belief; sums to 1."""
         _, state = await self._read(session_id, key_id)
         return await asyncio.wrap_future(self._worker.submit(lambda: state.belief.belief.mass))
-
-    async def next_best_view(
-        self, session_id: str, key_id: str | None = None
-    ) -> tuple[Plan | None, NDArray[np.float64]]:
-        """The move to make next, without a new view (None where the map can name none), and the moves there are."""
-        _, state = await self._read(session_id, key_id)
-        actions_m, localizer = state.engine.snapshot.actions_m, state.engine.localizer
-        if state.step is not None:
-            return state.step.plan, actions_m
-        return await asyncio.wrap_future(self._worker.submit(lambda: localizer.plan(state.belief))), actions_m
 
     async def newest(self, domain: str | None, before: int | None, limit: int) -> ListPage[ListedSession, int]:
         """A page of the living sessions, of a domain or all, newest first, behind number `before`."""
