@@ -18,8 +18,8 @@ from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.models import Job
 
 WITHIN_S = 60
-N_FRAMES, DIM = 800, 64
-CONFIG = {"training_traverse": "drive", "landmark_traverse": "other", "n_landmarks": 100}
+N_FRAMES, DIM = 400, 64
+CONFIG = {"training_traverse": "drive", "landmark_traverse": "other", "n_landmarks": 30}
 LONG, SHORT = 1_000_000, 300  # training episodes; the map's size bounds the former, at some seconds
 
 pytestmark = pytest.mark.slow
