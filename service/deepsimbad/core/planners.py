@@ -78,13 +78,19 @@ def plan_by_information(view: PlanningView) -> Plan:
     """
     actions_m = view.map.actions_m
     table = information_ahead(view.map, view.price_bits_per_m)
-    longest_first = np.lexsort((-actions_m, -np.abs(actions_m)))
     if table is None:
-        return Plan(INFORMED, float(actions_m[longest_first[0]]))
+        return Plan(INFORMED, _best(np.zeros(actions_m.size), actions_m))
     both = _averaged(view.mass, table.T)
     values, bits = both[: actions_m.size], both[actions_m.size :]
-    best = longest_first[np.argmax(values[longest_first])]
-    return Plan(INFORMED, float(actions_m[best]), values, bits=bits)
+    return Plan(INFORMED, _best(values, actions_m), values, bits=bits)
+
+
+def _best(values: NDArray[np.float64], actions_m: NDArray[np.float64]) -> float:
+    """The move of the greatest value; ties go to the longer move, and forward."""
+    best: tuple[float, float, float] = max(
+        zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True)
+    )
+    return best[2]
 
 
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:
