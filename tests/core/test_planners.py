@@ -26,10 +26,11 @@ def sharp(place):
 
 def view_of(mass=None, bits=None, closed=False, **more):
     actions_m = more.get("actions_m", ACTIONS_M)
+    n_images = N_IMAGES if bits is None else len(bits)
     map_ = Map(
         config={"relevance": "rrf", "n_landmarks": 1},
-        lists=np.zeros((1, N_IMAGES), np.uint16),
-        position_m=np.arange(float(N_IMAGES)),
+        lists=np.zeros((1, n_images), np.uint16),
+        position_m=np.arange(float(n_images)),
         closed=closed,
         actions_m=actions_m,
         view_bits=None if bits is None else bits.copy(),
@@ -105,6 +106,15 @@ def test_moves_are_weighed_by_the_whole_belief_and_ties_go_far(bits):
     assert plan_by_information(view_of(mass, flat)).action_m == 10
     for actions_m, longest_m in (((-10.0, 0.0, 10.0), 10), ((-10.0, 0.0, 9.0), -10)):
         assert plan_by_information(view_of(mass, flat, actions_m=np.array(actions_m))).action_m == longest_m
+
+
+def test_places_that_hold_next_to_nothing_move_no_average():
+    n_images, place = 2000, 700
+    mass = np.full(n_images, 3.5e-9)
+    mass[place] += 1 - mass.sum()
+    view = view_of(mass, (1 + np.random.default_rng(0).random(n_images)).astype(np.float32))
+    plan = plan_by_information(view)
+    np.testing.assert_allclose(np.r_[plan.values, plan.bits], information_ahead(view.map, 0.0)[place], rtol=3e-6)
 
 
 def test_metres_have_a_price(bits):

@@ -19,8 +19,8 @@ NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
 DEFAULT_PLANNER = INFORMED
 NNQL_NEIGHBOURS = 4  # k of the paper
 _DISCOUNT, _SWEEPS = 0.9, 60
-_NOTHING = 1e-12  # of a belief: places that hold less move no average
 _IMAGES_AT_ONCE = 256  # few enough for single precision
+_NOTHING = 1e-6  # of a belief: so many images that hold less together move no average
 _MOST_PRICES = 8  # whose tables are kept: of 26,000 images each takes 2 MB
 
 
@@ -152,17 +152,19 @@ _PLANNERS: dict[str, Planner] = {INFORMED: plan_by_information, NNQL: plan_by_ex
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _averaged(mass: NDArray[np.float64], columns: NDArray[np.float32]) -> NDArray[np.float64]:
     """[a] columns [a, n] averaged by mass. A loop of our own: BLAS would wake its threads for this."""
-    averages = np.zeros(len(columns))
+    averages, total = np.zeros(len(columns)), 0.0
     for begin in range(0, mass.size, _IMAGES_AT_ONCE):
         shares = mass[begin : begin + _IMAGES_AT_ONCE].astype(np.float32)
-        if shares.sum() < _NOTHING:
+        held = shares.sum()
+        if held < _NOTHING:
             continue
+        total += held
         for place in range(averages.size):
             column, some = columns[place, begin : begin + _IMAGES_AT_ONCE], np.float32(0)
             for image in range(shares.size):
                 some += shares[image] * column[image]
             averages[place] += some
-    return averages
+    return averages / total
 
 
 @njit(cache=True, nogil=True)
