@@ -78,19 +78,10 @@ def plan_by_information(view: PlanningView) -> Plan:
     """
     actions_m = view.map.actions_m
     table = information_ahead(view.map, view.price_bits_per_m)
-    if table is None:
-        return Plan(INFORMED, _best(np.zeros(actions_m.size), actions_m))
-    both = _averaged(view.mass, table.T)
+    both = np.zeros(2 * actions_m.size) if table is None else _averaged(view.mass, table.T)
     values, bits = both[: actions_m.size], both[actions_m.size :]
-    return Plan(INFORMED, _best(values, actions_m), values, bits=bits)
-
-
-def _best(values: NDArray[np.float64], actions_m: NDArray[np.float64]) -> float:
-    """The move of the greatest value; ties go to the longer move, and forward."""
-    best: tuple[float, float, float] = max(
-        zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True)
-    )
-    return best[2]
+    *_, best_m = max(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True))
+    return Plan(INFORMED, best_m) if table is None else Plan(INFORMED, best_m, values, bits)
 
 
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:
