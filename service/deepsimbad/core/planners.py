@@ -155,7 +155,7 @@ def _averaged(mass: NDArray[np.float64], columns: NDArray[np.float32]) -> NDArra
             for image in range(shares.size):
                 some += shares[image] * column[image]
             averages[place] += some
-    return averages / total
+    return averages / max(total, _NOTHING)
 
 
 @njit(cache=True, nogil=True)
