@@ -212,8 +212,7 @@ class _Request:
         if self._scope["path"] in ALWAYS_ANSWERED:
             self._was_counted = True
         elif not has_body:
-            self._door.under_way.take()
-            self._was_counted, self._n_turns = True, 1
+            self._count()
         elif n_declared > FREE_BYTES and not self._is_batch:
             # Only asked for: who announces much and sends nothing should keep nobody out.
             self._door.body_bytes.check(n_declared - FREE_BYTES)
@@ -232,8 +231,7 @@ class _Request:
                 self._door.body_bytes.take(n_more)
                 self._n_held += n_more
             if not self._was_counted and not message.get("more_body", False):
-                self._door.under_way.take()
-                self._was_counted, self._n_turns = True, 1
+                self._count()
         return message
 
     async def send(self, message: Message) -> None:
@@ -273,6 +271,10 @@ class _Request:
                 "ms": round(seconds * 1000, 2),
             }
             log.info("request", extra=line | about)
+
+    def _count(self) -> None:
+        self._door.under_way.take()
+        self._was_counted, self._n_turns = True, 1
 
     def _too_large(self, what: str) -> BodyTooLargeError:
         most = self._most_bytes

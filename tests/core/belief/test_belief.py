@@ -330,7 +330,7 @@ def test_a_robot_that_was_carried_is_found_again(kind, route):
         if 5 <= step <= 13:
             found.append(abs(int(belief.mass.argmax()) - at) <= 2)
             doubted = max(doubted, belief.off_route)
-    assert doubted > 0.1
+    assert doubted > (0.2 if kind is FilterKind.GRID else 0.1)
     assert sum(found[:6]) >= 3
     assert all(found[4:])
 
