@@ -10,7 +10,7 @@ from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
 from deepsimbad.evaluators.extractors import netvlad, squeezenet
 from deepsimbad.evaluators.extractors.efficientnet_lite0 import EfficientNetLite0
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN
-from deepsimbad.evaluators.weights import downloads, squeezenet_families
+from deepsimbad.evaluators.weights import downloads
 from deepsimbad.evaluators.weights.downloads import pull_file, unpack
 from deepsimbad.evaluators.weights.files import file_sha256
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known
@@ -46,7 +46,7 @@ def test_what_is_stated_of_our_own_extractors_is_so():
     ours = known("efficientnet-lite0")
     assert (ours.encoding_dim, ours.input_size) == (EfficientNetLite0.encoding_dim, EfficientNetLite0.input_size)
     assert known("squeezenet").encoding_dim == squeezenet.ENCODING_DIM
-    assert known("squeezenet").input_size == (squeezenet_families.TORCHVISION.side,) * 2
+    assert known("squeezenet").input_size == (squeezenet.TORCHVISION.side,) * 2
     for name, preset in (
         ("netvlad-pitts30k", netvlad.MATLAB),
         ("netvlad-tokyotm", netvlad.MATLAB),

@@ -15,8 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
-from deepsimbad.evaluators.lessons import Split, UnitLesson, Verdict, no_better
-from deepsimbad.evaluators.trunk import Axes, Trunk
+from deepsimbad.evaluators.trunk import Axes, Split, Trunk, UnitLesson, Verdict, no_better
 
 _BOTTLENECK = 4
 _EPOCHS, _RATE, _DECAY = 150, 3e-3, 3e-3
@@ -70,7 +69,6 @@ class Autoencoder(Trunk):
         return Fitted(arrays, metrics, warnings)
 
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `OwnDissimilarities`."""
         names = (*_TRAINED, "deviation")
         trained = {name: np.ascontiguousarray(model[f"{self.kind}_{name}"], np.float32) for name in names}
         return _deviations(self.units(encodings, model), trained)

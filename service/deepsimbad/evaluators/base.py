@@ -13,6 +13,8 @@ where it is any other, a scene's *dissimilarities to all fitted landmarks* take 
 D(x, R) is a vector space, each landmark a dimension. `compared` gives the one or the other. All else, standardising by
 season, places as sums, lists, live statistics, is the same for all evaluators (docs/decisions/0029-own-space.md).
 `evaluators.space.OwnDissimilarities` does this for an evaluator that says its `own_dissimilarities`.
+
+Methods that keep the contract, and have no more to say of it, are described here alone.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

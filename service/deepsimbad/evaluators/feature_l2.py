@@ -14,7 +14,7 @@ from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import Extractor
 from deepsimbad.evaluators.registry import ExtractorName, make_extractor
 from deepsimbad.evaluators.scenes import Form, Scene, picture_in
-from deepsimbad.evaluators.space import between_units, check_units
+from deepsimbad.evaluators.space import between_units, check_length, check_units
 
 _SCENES_AT_ONCE = 16  # half a megabyte at d = 8,064, which stays in the cache
 _NUMBERS_A_SUM = 256
@@ -33,22 +33,16 @@ class FeatureL2:
 
     def __init__(self, extractor: str, compute: Compute | None = None) -> None:
         self._name, self._compute = extractor, compute or Compute()
+        self.forms = frozenset[Form]() if extractor == ExtractorName.NONE else frozenset({Form.IMAGE})
         self._loading = threading.Lock()
         self._loaded: Extractor | None = None
 
-    @property
-    def forms(self) -> frozenset[Form]:
-        """See `Evaluator`."""
-        return frozenset({Form.IMAGE}) if self.takes_images else frozenset()
-
     def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:  # noqa: ARG002
-        """See `Evaluator`."""
         return frozenset()
 
     @property
     def takes_images(self) -> bool:
-        """See `Evaluator`."""
-        return self._name != ExtractorName.NONE
+        return Form.IMAGE in self.forms
 
     @property
     def input_size(self) -> tuple[int, int] | None:
@@ -62,7 +56,6 @@ class FeatureL2:
 
     @property
     def halves(self) -> tuple[int, ...]:
-        """See `Evaluator`."""
         return ()
 
     @property
@@ -72,7 +65,6 @@ class FeatureL2:
 
     @property
     def largest_batch(self) -> int:
-        """See `Evaluator`."""
         return self._extractor.largest_batch if self.takes_images else 1
 
     def load(self) -> None:
@@ -88,13 +80,11 @@ class FeatureL2:
             return self._loaded
 
     def prepare(self, image: Image) -> Image:
-        """See `Evaluator.prepare`."""
         self._check((image,))
         with named_lack_of_memory("prepare"):
             return self._extractor.prepare(image)
 
     def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
-        """See `Evaluator.encode`."""
         pictures = [image for image in map(picture_in, images) if image is not None]
         self._check(pictures)
         with named_lack_of_memory("encode"):
@@ -110,7 +100,6 @@ class FeatureL2:
                 raise InvalidImageError(f"an image is [height, width, 3] uint8, not {list(image.shape)} {image.dtype}")
 
     def fit(self, lesson: Lesson) -> Fitted:
-        """See `Evaluator.fit`."""
         return Fitted(self.fit_landmarks(checked_encodings(lesson.encodings)[lesson.landmarks]))
 
     def fit_landmarks(self, encodings: NDArray[np.float32]) -> LandmarkModel:
@@ -134,19 +123,13 @@ class FeatureL2:
         prototypes = np.ascontiguousarray(model["prototypes"], np.float32)
         if is_composed(model):
             return between_units(encodings, model)
-        if encodings.ndim != 2 or encodings.shape[1] != prototypes.shape[1]:
-            raise InvalidEncodingError(
-                f"an encoding of {encodings.shape[-1]} numbers cannot be compared with landmarks of "
-                f"{prototypes.shape[1]}: they come from another encoder",
-                encoding_dim=prototypes.shape[1],
-            )
+        check_length(encodings, prototypes.shape[1])
         answer = squared_distances(np.ascontiguousarray(encodings, np.float32), prototypes)
         if not np.isfinite(answer).all():
             raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
         return answer
 
     def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:  # noqa: ARG002
-        """See `Evaluator.compared`."""
         return encodings
 
 

@@ -17,7 +17,7 @@ from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, LandmarkModel, Lesson
 from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
 from deepsimbad.evaluators.scenes import Form, Scene
-from deepsimbad.evaluators.space import as_usual, between_units
+from deepsimbad.evaluators.space import as_usual, between_units, squared_between
 
 _WEIGHT = "fused_weight"
 _TRIED = np.linspace(0, 1, 11)  # of the first half
@@ -34,55 +34,38 @@ class Fused(FeatureL2):
     def __init__(self, halves: Sequence[Evaluator]) -> None:
         super().__init__("none")
         self._halves = tuple(halves)
-
-    @property
-    def forms(self) -> frozenset[Form]:
-        """See `Evaluator`."""
-        return frozenset().union(*(half.forms for half in self._halves))
-
-    @property
-    def takes_images(self) -> bool:
-        """See `Evaluator`."""
-        return Form.IMAGE in self.forms
+        self.forms = frozenset[Form]().union(*(half.forms for half in self._halves))
 
     @property
     def input_size(self) -> tuple[int, int] | None:
-        """See `Evaluator`."""
         return next((half.input_size for half in self._halves if half.takes_images), None)
 
     @property
     def encoding_dim(self) -> int:
-        """See `Evaluator`."""
         return sum(self.halves)
 
     @property
     def halves(self) -> tuple[int, ...]:
-        """See `Evaluator`."""
         return tuple(half.encoding_dim or 0 for half in self._halves)
 
     @property
     def weights_sha256(self) -> str | None:
-        """See `Evaluator`."""
         known = [half.weights_sha256 for half in self._halves if half.weights_sha256]
         return "+".join(known) or None
 
     @property
     def largest_batch(self) -> int:
-        """See `Evaluator`."""
         return max(half.largest_batch for half in self._halves)
 
     def load(self) -> None:
-        """See `Evaluator`."""
         for half in self._halves:
             half.load()
 
     def prepare(self, image: Image) -> Image:
-        """See `Evaluator`."""
         taking = next((half for half in self._halves if half.takes_images), self._halves[0])
         return taking.prepare(image)
 
     def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:
-        """See `Evaluator`."""
         return frozenset().union(*(half.forms for half in self._halves if not half.forms & forms))
 
     def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
@@ -111,14 +94,12 @@ class Fused(FeatureL2):
         return Fitted({**model, _WEIGHT: np.array([weight], np.float32)}, metrics)
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
-        """See `Evaluator.check_model`."""
         super().check_model(model, n_landmarks)
         weight = np.asarray(model.get(_WEIGHT, [_EVEN]), np.float32)
         if weight.shape != (1,) or not 0 <= weight[0] <= 1:
             raise InvalidEncodingError("the weight of a fused landmark model is one number within 0 and 1")
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Evaluator.dissimilarities`."""
         if is_composed(model):
             return between_units(as_usual(self.compared(encodings, model), model), model)
         super().dissimilarities(encodings, model)  # which refuses what cannot be compared
@@ -145,10 +126,7 @@ class Fused(FeatureL2):
         self, scenes: NDArray[np.float32], landmarks: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """[n, r] squared L2 of either half."""
-        first, second = (
-            np.asarray(np.clip(2 - 2 * (a @ b.T), 0, 4), np.float32)
-            for a, b in zip(self._split(scenes), self._split(landmarks), strict=True)
-        )
+        first, second = map(squared_between, self._split(scenes), self._split(landmarks))
         return first, second
 
 

@@ -32,33 +32,28 @@ class Language(FeatureL2):
         compute: Where that folder is.
     """
 
-    forms = frozenset({Form.TEXT})
-    takes_images = False
     input_size = None
     largest_batch = 1
 
     def __init__(self, extractor: str, compute: Compute | None = None) -> None:
         super().__init__("none", compute)
+        self.forms = frozenset({Form.TEXT})
         self._model_name = extractor
         self._reading = threading.Lock()
         self._read: tuple[SentenceBert, str] | None = None
 
     @property
     def encoding_dim(self) -> int:
-        """See `Evaluator`."""
         return self._model()[0].encoding_dim
 
     @property
     def weights_sha256(self) -> str | None:
-        """See `Evaluator`."""
         return self._model()[1]
 
     def load(self) -> None:
-        """See `Evaluator`."""
         self._model()
 
     def prepare(self, image: Image) -> Image:  # noqa: ARG002
-        """See `Evaluator`."""
         raise UnsupportedMediaTypeError(
             "this domain takes texts, not images", allowed=["text/plain", "application/json"]
         )

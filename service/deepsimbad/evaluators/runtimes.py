@@ -169,7 +169,6 @@ class _OnnxRun:
         self._threads = ThreadPoolExecutor(n_threads, "onnxruntime")
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """See `Run`."""
         if len(pixels) == 1:
             return self._one(pixels)
         return np.concatenate(list(self._threads.map(self._one, np.split(pixels, len(pixels)))))

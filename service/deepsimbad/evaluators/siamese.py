@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.evaluators.base import Fitted, LandmarkModel, Lesson
-from deepsimbad.evaluators.lessons import PairScores, Split, UnitLesson, Verdict, no_better, squared_l2
-from deepsimbad.evaluators.trunk import Axes, Trunk
+from deepsimbad.evaluators.space import squared_between
+from deepsimbad.evaluators.trunk import Axes, PairScores, Split, Trunk, UnitLesson, Verdict, no_better
 
 _HIDDEN = 32
 _EPOCHS, _BATCH, _MOST_QUERIES = 40, 64, 2048  # queries: at once, and an epoch
@@ -35,7 +35,6 @@ class Siamese(Trunk):
     }  # fmt: skip
 
     def fit(self, lesson: Lesson) -> Fitted:
-        """See `Evaluator.fit`."""
         began = time.monotonic()
         arrays, units = self.unit_lesson(lesson)
         split = Split.of(units, lesson.seed)
@@ -50,7 +49,6 @@ class Siamese(Trunk):
         return Fitted(arrays, metrics, () if verdict.is_better else (no_better(self.kind, verdict),))
 
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `OwnDissimilarities`."""
         trained = {name: np.asarray(model[f"{self.kind}_{name}"], np.float32) for name in _TRAINED}
         landmarks = np.asarray(model[f"{self.kind}_landmarks"], np.float32)
         return _dissimilarities(self.units(encodings, model), landmarks, trained)
@@ -146,7 +144,7 @@ def _retrieved(units: UnitLesson, split: Split) -> NDArray[np.int64]:
     nearest = np.empty((len(split.train), n), np.int64)
     for first in range(0, len(split.train), 1024):
         rows = split.train[first : first + 1024]
-        apart = squared_l2(units.queries[rows], units.own[split.wrong])
+        apart = squared_between(units.queries[rows], units.own[split.wrong])
         apart[units.is_near(units.true[rows][:, np.newaxis], split.wrong)] = np.inf
         nearest[first : first + 1024] = split.wrong[np.argpartition(apart, n - 1, axis=1)[:, :n]]
     return nearest

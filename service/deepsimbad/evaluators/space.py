@@ -16,7 +16,6 @@ class OwnDissimilarities(ABC):
     """An evaluator whose dissimilarity is no squared L2 of encodings; the composed arrays lie beside its own ones."""
 
     is_squared_l2 = False
-    halves: tuple[int, ...] = ()
 
     @abstractmethod
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
@@ -29,7 +28,6 @@ class OwnDissimilarities(ABC):
         return self.own_dissimilarities(encodings, model)
 
     def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Evaluator.compared`."""
         return self.own_dissimilarities(encodings, model)
 
 
@@ -63,17 +61,30 @@ def between_units(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray
 
 def unit_vectors(vectors: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
     """[n, k] u of what is compared, by what is usual on the map; raises InvalidEncodingError."""
-    usual = np.asarray(model["usual"], np.float32)
-    if vectors.ndim != 2 or vectors.shape[1] != usual.shape[1]:
-        raise InvalidEncodingError(
-            f"an encoding of {vectors.shape[-1]} numbers cannot be compared with landmarks of {usual.shape[1]}: they "
-            "come from another encoder",
-            encoding_dim=usual.shape[1],
-        )
-    moments = Moments.from_mean_std(usual)
+    return units_by(vectors, model["usual"], model.get("projection"))
+
+
+def units_by(
+    vectors: NDArray[np.float32],
+    usual: NDArray[np.generic],
+    projection: NDArray[np.generic] | None,
+    compared: str = "with landmarks of",
+) -> NDArray[np.float32]:
+    """[n, k] u of vectors [n, d], by what is usual [2, d]; raises InvalidEncodingError as `check_length`."""
+    check_length(vectors, usual.shape[1], compared)
+    moments = Moments.from_mean_std(np.asarray(usual, np.float32))
     check_usable(vectors, moments)
-    projection = np.asarray(model["projection"], np.float32) if "projection" in model else None
-    return described(vectors, moments, projection)
+    return described(vectors, moments, None if projection is None else np.asarray(projection, np.float32))
+
+
+def check_length(encodings: NDArray[np.float32], d: int, compared: str = "with landmarks of") -> None:
+    """Raise InvalidEncodingError where encodings are not [n, d], which says how they are `compared`."""
+    if encodings.ndim != 2 or encodings.shape[1] != d:
+        raise InvalidEncodingError(
+            f"an encoding of {encodings.shape[-1]} numbers cannot be compared {compared} {d}: they come from another "
+            "encoder",
+            encoding_dim=d,
+        )
 
 
 def squared_between(u: NDArray[np.float32], prototypes: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -11,6 +11,8 @@ from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.runtimes import Run
 
+_LONGEST_SIDE = 1024  # pixels, where images keep their aspect; larger ones are reduced
+
 
 class Extractor(Protocol):
     """A pure function from images to unit-length encodings. Loaded when it is made; usable from several threads."""
@@ -56,20 +58,14 @@ class NetworkExtractor:
     run: Run  # the network, ready
     encoding_dim: int  # d
     weights_sha256: str | None  # as `encodings_sha256` gives it
-    input_size: tuple[int, int] | None  # (width, height) every image is brought to; None: see `longest_side`
-    # where images keep their aspect, the most pixels of their longer side; larger ones are reduced
-    longest_side: int = 1024
-    side_multiple: int = 1  # where images keep their aspect, width and height are brought down to multiples of this
-    # where images keep their aspect, the fewest pixels of either side; smaller ones are enlarged
-    shortest_side: int = 1
+    input_size: tuple[int, int] | None  # (width, height) every image is brought to; None: they keep their aspect
+    shortest_side: int = 1  # of those, in pixels; smaller ones are enlarged
 
     @property
     def largest_batch(self) -> int:
-        """See `Extractor`."""
         return self.run.largest_batch
 
     def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
-        """See `Extractor`."""
         encodings = np.empty((len(images), self.encoding_dim), np.float32)
         first = 0
         while first < len(images):
@@ -85,11 +81,9 @@ class NetworkExtractor:
         return encodings
 
     def prepare(self, image: Image) -> Image:
-        """See `Extractor`."""
         height, width = image.shape[:2]
         if self.input_size is not None:
             return resized(image, self.input_size)
-        shrink = min(1.0, self.longest_side / max(width, height))
-        least = max(self.side_multiple, self.shortest_side)
-        wide, high = (max(least, round(side * shrink)) for side in (width, height))
-        return resized(image, (wide - wide % self.side_multiple, high - high % self.side_multiple))
+        shrink = min(1.0, _LONGEST_SIDE / max(width, height))
+        wide, high = (max(self.shortest_side, round(side * shrink)) for side in (width, height))
+        return resized(image, (wide, high))

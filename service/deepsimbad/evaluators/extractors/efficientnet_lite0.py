@@ -48,15 +48,12 @@ class EfficientNetLite0:
 
     @property
     def largest_batch(self) -> int:
-        """See `Extractor`."""
         return self._network.largest_batch
 
     def prepare(self, image: Image) -> Image:
-        """See `Extractor`."""
         return self._network.prepare(image)
 
     def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
-        """See `Extractor`."""
         encodings = np.empty((len(images), self.encoding_dim), np.float32)
         at_size = [self.prepare(image) for image in images]
         gradients = self._beside.submit(self._gradients.encode, at_size)

@@ -38,10 +38,8 @@ def netvlad(file: str, compute: Compute) -> NetworkExtractor:
     weights = read_netvlad(path)
     preset = weights.preset
     run = make_run(weights.module, compute, preset.input_size or _USUAL_SIZE)
-    return NetworkExtractor(
-        run, weights.encoding_dim, encodings_sha256(sha256, _RECIPE), preset.input_size,
-        longest_side=preset.longest_side, shortest_side=_SHORTEST_SIDE,
-    )  # fmt: skip
+    digest = encodings_sha256(sha256, _RECIPE)
+    return NetworkExtractor(run, weights.encoding_dim, digest, preset.input_size, _SHORTEST_SIDE)
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,6 @@ class Preset:
     mean: tuple[float, float, float] | None  # of RGB, of pixels 0..255, taken away from them; None: the file holds it
     deviation: tuple[float, float, float]  # what they are then divided by
     input_size: tuple[int, int] | None  # (width, height) in pixels; None: the aspect is kept
-    longest_side: int = 1024  # where the aspect is kept, the most pixels of the longer side
 
 
 @dataclass(frozen=True)

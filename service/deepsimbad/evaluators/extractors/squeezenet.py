@@ -2,16 +2,26 @@
 
 The map is that behind the last fire module, at stride 16. On Nordland, the corridor and the rendered campus the modules
 5, 7 and 8 found fewer places across seasons, and 7 and 9 together hardly more for nearly twice the numbers.
+
+Two families of weights are public, told apart by what a file holds: Caffe's, as its authors trained it, in an npz
+(`conv1/w`, `fire2/conv1x1_1/w`, ...), and torchvision's checkpoint (`features.0.weight`, `features.3.squeeze.weight`,
+...). Each was trained on pixels of its own order and scale.
 """
 
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from deepsimbad.errors import MissingPackageError
+import numpy as np
+
+from deepsimbad.errors import InvalidWeightsError, MissingPackageError
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors.base import NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
-from deepsimbad.evaluators.weights.files import encodings_sha256
+from deepsimbad.evaluators.weights.files import check_size, encodings_sha256, fill, load_checkpoint
 from deepsimbad.evaluators.weights.lock import Lock
 
 if TYPE_CHECKING:
@@ -21,24 +31,112 @@ CELLS = (6, 5)  # rows and columns, as of the default extractor
 TAKEN = {9: 512}  # fire module -> its channels
 ENCODING_DIM = CELLS[0] * CELLS[1] * sum(TAKEN.values())
 _RECIPE = 1  # see `encodings_sha256`
+# Fire module (the paper counts the first convolution as layer 1) -> torchvision's layer, which counts maxima too
+_LAYERS = dict(zip(range(2, 10), (3, 4, 5, 7, 8, 9, 10, 12), strict=True))
+# What a fire module's parts are called here, by Caffe and by torchvision
+_PARTS = (
+    ("squeeze", "conv1x1_1", "squeeze"), ("expand_1x1", "conv1x1_2", "expand1x1"),
+    ("expand_3x3", "conv3x3_2", "expand3x3"),
+)  # fmt: skip
 
 
 def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
     """As the registry makes it; a file in the weights' folder; raises as `Evaluator.load`."""
     if not has_torch():
         raise MissingPackageError(f"squeezenet needs PyTorch: {INSTALL_TORCH}")
-    from deepsimbad.evaluators.weights.squeezenet_families import preset_of
-
     path, sha256 = Lock.read(compute.weights_dir).pinned(file)
-    size = (preset_of(path).side,) * 2
+    # Told from a glance: whether the file is whole shows when it is read
+    size = ((CAFFE if _is_npz(path) else TORCHVISION).side,) * 2
     run = make_run(lambda: _module(path), compute, size, f"squeezenet-{_RECIPE}-{sha256[:16]}")
     return NetworkExtractor(run, ENCODING_DIM, encodings_sha256(sha256, _RECIPE), size)
 
 
 def _module(path: Path) -> "nn.Module":
     from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
-    from deepsimbad.evaluators.weights.squeezenet_families import read_squeezenet
 
     weights = read_squeezenet(path)
     preset = weights.preset
     return SpatialGrid(weights.trunk(tuple(TAKEN)), CELLS, preset.mean, preset.std, is_rgb=preset.is_rgb)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What goes with the weights of a family."""
+
+    family: str  # its name
+    is_rgb: bool  # whether the network takes red first
+    mean: tuple[float, float, float]  # in that order, of pixels 0..255, taken away from them
+    std: tuple[float, float, float]  # what they are then divided by
+    side: int  # width and height in pixels
+
+
+CAFFE = Preset("caffe", is_rgb=False, mean=(104.0, 117.0, 123.0), std=(1.0, 1.0, 1.0), side=227)
+TORCHVISION = Preset(
+    "torchvision", is_rgb=True, mean=(0.485 * 255, 0.456 * 255, 0.406 * 255),
+    std=(0.229 * 255, 0.224 * 255, 0.225 * 255), side=224,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SqueezeNetWeights:
+    """A file's weights under the names of `SqueezeNet`, and the preset they came with."""
+
+    preset: Preset
+    tensors: Mapping[str, Any]
+    file: str
+
+    def trunk(self, taken: tuple[int, ...]) -> "nn.Module":
+        """The network of these weights up to the last fire module taken; raises InvalidWeightsError."""
+        from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
+
+        trunk = SqueezeNet(taken)
+        fill(trunk, self.tensors, self.file)
+        return trunk
+
+
+def read_squeezenet(path: Path) -> SqueezeNetWeights:
+    """Read a file of either family; raises InvalidWeightsError."""
+    if _is_npz(path):
+        return SqueezeNetWeights(CAFFE, _of_caffe(path), path.name)
+    content = load_checkpoint(path)
+    if not isinstance(content, Mapping):
+        raise InvalidWeightsError(f"{path.name} holds no weights by name", file=path.name)
+    tensors = {ours: content.get(theirs) for ours, theirs in _names(is_caffe=False).items()}
+    return SqueezeNetWeights(TORCHVISION, tensors, path.name)
+
+
+def _is_npz(path: Path) -> bool:
+    """Whether it is an archive of arrays; PyTorch's checkpoints are archives too."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith(".npy") for name in archive.namelist())
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return False
+
+
+def _of_caffe(path: Path) -> dict[str, Any]:
+    import torch
+
+    check_size(path)
+    tensors: dict[str, Any] = {}
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            for ours, theirs in _names(is_caffe=True).items():
+                if theirs in arrays.files and arrays[theirs].dtype.kind == "f":
+                    tensors[ours] = torch.from_numpy(np.array(arrays[theirs], np.float32))
+    except (ValueError, OSError, EOFError, KeyError, MemoryError, NotImplementedError, RuntimeError, zlib.error,
+            zipfile.BadZipFile) as error:  # fmt: skip
+        raise InvalidWeightsError(f"{path.name} is no whole archive of arrays", file=path.name) from error
+    return tensors
+
+
+def _names(is_caffe: bool) -> dict[str, str]:
+    """Ours to the family's."""
+    names: dict[str, str] = {}
+    for kind, short in (("weight", "w"), ("bias", "b")):
+        names[f"stem.{kind}"] = f"conv1/{short}" if is_caffe else f"features.0.{kind}"
+        for fire, layer in _LAYERS.items():
+            for ours, caffe, torchvision in _PARTS:
+                theirs = f"fire{fire}/{caffe}/{short}" if is_caffe else f"features.{layer}.{torchvision}.{kind}"
+                names[f"fires.{fire}.{ours}.{kind}"] = theirs
+    return names

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-FIRST_FIRE, LAST_FIRE = 2, 9  # the paper counts the first convolution as layer 1
+_FIRST_FIRE = 2  # the paper counts the first convolution as layer 1
 _STEM_CHANNELS = 96
 # (channels left by the squeeze, channels of each of the two expansions) of the fire modules, in order.
 _FIRES = ((16, 64), (16, 64), (32, 128), (32, 128), (48, 192), (48, 192), (64, 256), (64, 256))
@@ -27,7 +27,7 @@ class SqueezeNet(nn.Module):
         self.stem = nn.Conv2d(3, _STEM_CHANNELS, 7, stride=2)
         self.fires = nn.ModuleDict()
         n_inputs = _STEM_CHANNELS
-        for number, (n_squeezed, n_expanded) in enumerate(_FIRES[: self._taken[-1] - FIRST_FIRE + 1], FIRST_FIRE):
+        for number, (n_squeezed, n_expanded) in enumerate(_FIRES[: self._taken[-1] - _FIRST_FIRE + 1], _FIRST_FIRE):
             self.fires[str(number)] = _Fire(n_inputs, n_squeezed, n_expanded)
             n_inputs = 2 * n_expanded
 
