@@ -24,7 +24,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'deep
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 N_FRAMES = 60
 
-from deepsimbad.fleet import encode  # noqa: E402 - takes Ray
+from deepsimbad.fleet import drives  # noqa: E402 - takes Ray
 from deepsimbad.fleet.drives import stored_drive  # noqa: E402
 
 
@@ -60,7 +60,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def packs(monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(encode, "_FRAMES_A_PACK", 8)
+    monkeypatch.setattr(drives, "_FRAMES_A_PACK", 8)
     return 8
 
 
@@ -69,7 +69,7 @@ def elsewhere(drive: Path, folder: Path, on_progress: Any, kind: str = "gradient
     measure = make_evaluator(configuration, Compute())
     recording = read_folder(drive, 1.0)
     given = (recording, measure, dict(configuration.as_dict()), Compute(), 50_000_000)
-    return list(encode.encoded_elsewhere(*given, folder, on_progress))
+    return list(drives.encoded_elsewhere(*given, folder, on_progress))
 
 
 class Noon(datetime):
@@ -114,7 +114,7 @@ def test_a_drive_in_an_object_store_is_copied_and_makes_the_same_map(
         assert run([*many, f"{url}#5:"]) == 1
         assert "no objects" in capsys.readouterr().err
         shutil.copytree(drive, bucket.folder / "drives" / drive.name)
-        monkeypatch.setattr(encode, "encoded_elsewhere", lambda *_: pytest.fail("killed"))
+        monkeypatch.setattr(drives, "encoded_elsewhere", lambda *_: pytest.fail("killed"))
         with pytest.raises(pytest.fail.Exception):
             run([*many, f"{url}#5:"])
         monkeypatch.undo()
@@ -189,10 +189,10 @@ def test_what_was_encoded_before_a_kill_is_not_encoded_again(drive: Path, packs:
 def test_a_worker_that_does_not_reach_the_drive_is_named(
     drive: Path, packs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Unreached(encode._Encoder):
+    class Unreached(drives._Encoder):
         def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
             raise RuntimeError("no such folder")
 
-    monkeypatch.setattr(encode, "_Encoder", Unreached)
+    monkeypatch.setattr(drives, "_Encoder", Unreached)
     with pytest.raises(UnavailableError, match="could not be encoded elsewhere"):
         elsewhere(drive, tmp_path, lambda _: None)

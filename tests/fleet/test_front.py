@@ -17,9 +17,9 @@ pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=I
 
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
     from deepsimbad.fleet import backend, front
-    from deepsimbad.fleet.administrators import Administrators
     from deepsimbad.fleet.backend import Backend, Gone
     from deepsimbad.fleet.front import Front, added_up
+    from deepsimbad.fleet.owners import Administrators
 
 
 def told(n_requests, n_sessions, ready):

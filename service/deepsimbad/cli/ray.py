@@ -50,8 +50,7 @@ def map_on_ray(
     Frames that were encoded are kept: after a kill the same command goes on.
     """
     _required()
-    from deepsimbad.fleet.drives import StoredDrive, stored_drive  # noqa: PLC0415
-    from deepsimbad.fleet.encode import encoded_elsewhere, joined  # noqa: PLC0415 - takes Ray
+    from deepsimbad.fleet.drives import StoredDrive, encoded_elsewhere, joined, stored_drive  # noqa: PLC0415 - takes Ray
 
     settings = given_settings()
     folder = domain_folder(settings.data_dir, domain) / "encoding"
@@ -121,7 +120,7 @@ def serve(
     settings = given_settings(host=host, port=port)
     _required()
     from deepsimbad.fleet import application  # noqa: PLC0415 - takes Ray
-    from deepsimbad.fleet.encode import joined  # noqa: PLC0415
+    from deepsimbad.fleet.drives import joined  # noqa: PLC0415
 
     os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
     joined(address)

@@ -274,11 +274,6 @@ class Replica:
 
 def _new_folder() -> Path:
     """An empty folder of this process's, once those of processes that were killed were removed."""
-    _clear_away()
-    return Path(tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-"))
-
-
-def _clear_away() -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
         with suppress(OSError):  # another user's
             process = Path("/proc", folder.name.removeprefix(_FOLDER_PREFIX).partition("-")[0], "exe")
@@ -287,3 +282,4 @@ def _clear_away() -> None:
             if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
                 shutil.rmtree(folder, ignore_errors=True)
                 os.close(descriptor)
+    return Path(tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-"))
