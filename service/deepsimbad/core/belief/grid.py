@@ -273,7 +273,6 @@ def _moved(
     source = np.empty(n + 2 * width)
     on_route = source[width : width + n]
     for t in range(n_trusts):
-        source[:] = 0.0
         if closed:
             turn = shift % n
             on_route[turn:] = masses[t, : n - turn]
@@ -283,7 +282,11 @@ def _moved(
         else:
             least, most = max(first, -shift), min(stop, n - shift)  # cells that need not be held at an end
             if most > least:
+                source[: width + least + shift] = 0.0
                 on_route[least + shift : most + shift] = masses[t, least:most]
+                source[width + most + shift :] = 0.0
+            else:
+                source[:] = 0.0
             for i in range(first, min(least, stop)):
                 on_route[0] += masses[t, i]
             for i in range(max(most, first), stop):
