@@ -27,6 +27,7 @@ from deepsimbad.store.layout import catalog_path
 
 log = logging.getLogger(__name__)
 
+_CONTAINERS_A_COLLECTION = 10_000  # answers leave no cycles, and at Python's 700 looking costs them a twentieth
 _ENCODER = json.JSONEncoder(default=str)
 _N_STANDARD = len(logging.makeLogRecord({}).__dict__)
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
@@ -98,8 +99,6 @@ def configure_logging(level: str) -> None:
             },
         }
     )
-
-_CONTAINERS_A_COLLECTION = 10_000  # answers leave no cycles, and at Python's 700 looking costs them a twentieth
 
 
 class _Server(uvicorn.Server):

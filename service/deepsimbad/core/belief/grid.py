@@ -280,13 +280,11 @@ def _moved(
             source[:width] = source[n : n + width]
             source[width + n :] = source[width : 2 * width]
         else:
-            least, most = max(first, -shift), min(stop, n - shift)  # cells that need not be held at an end
-            if most > least:
-                source[: width + least + shift] = 0.0
-                on_route[least + shift : most + shift] = masses[t, least:most]
-                source[width + most + shift :] = 0.0
-            else:
-                source[:] = 0.0
+            least = max(first, -shift)  # cells from here on need not be held at an end,
+            most = max(least, min(stop, n - shift))  # until here
+            source[: width + least + shift] = 0.0
+            on_route[least + shift : most + shift] = masses[t, least:most]
+            source[width + most + shift :] = 0.0
             for i in range(first, min(least, stop)):
                 on_route[0] += masses[t, i]
             for i in range(max(most, first), stop):
