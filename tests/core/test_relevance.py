@@ -75,7 +75,7 @@ def test_shortlist_is_the_stable_order(length):
 def test_live_statistics_start_as_the_maps_and_follow_the_views():
     rng = np.random.default_rng(0)
     usual = LandmarkStatistics.of_map(rank_landmarks(rng.random((30, 6))))
-    again = LandmarkStatistics.from_mean_std(usual.mean, usual.std)
+    again = LandmarkStatistics.from_mean_std(np.stack([usual.mean, usual.std]))
     np.testing.assert_allclose(again.square, usual.square)
     followed = usual
     view = rank_landmarks([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])

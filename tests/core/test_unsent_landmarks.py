@@ -16,7 +16,7 @@ NORMAL = NormalDist()
 def statistics_of(n_landmarks, seed=3, loadings=None):
     rng = np.random.default_rng(seed)
     mean, std = 0.5 * rng.normal(size=n_landmarks), rng.uniform(0.5, 1.2, n_landmarks)
-    return LandmarkStatistics.from_mean_std(mean, std, loadings=loadings)
+    return replace(LandmarkStatistics.from_mean_std(np.stack([mean, std])), loadings=loadings)
 
 
 def moments_beyond(mean, std, least):
@@ -126,7 +126,7 @@ def test_a_long_drive_of_short_lists_keeps_its_statistics_sane():
 
 def test_far_beyond_what_is_usual_numbers_stay_numbers():
     for far in (-60.0, -30.0, 30.0, 60.0):
-        usual = LandmarkStatistics.from_mean_std(np.full(5, far), np.full(5, 0.9))
+        usual = LandmarkStatistics.from_mean_std(np.stack([np.full(5, far), np.full(5, 0.9)]))
         view = usual.view(ranks_from_ranked_landmarks([2], 5))
         assert np.isfinite(view.z).all()
         assert ((view.certainty >= 0) & (view.certainty <= 1)).all()

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.frames import MAX_POSITION_M
+from deepsimbad.core.frames import MAX_POSITION_M, Camera
 from deepsimbad.errors import (
     DamagedFileError,
     DeepSimbadError,

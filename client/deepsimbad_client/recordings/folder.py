@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as Pictures
 
-from deepsimbad.core.camera import UPRIGHT_TURN
+from deepsimbad.core.frames import UPRIGHT_TURN
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import (
     HEIC_SUFFIXES,

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.camera import NCLT_STORED_SIZE, UPRIGHT_TURN, Camera
+from deepsimbad.core.frames import NCLT_STORED_SIZE, UPRIGHT_TURN, Camera
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,

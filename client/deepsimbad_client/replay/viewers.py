@@ -15,8 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.earth import on_earth
-from deepsimbad.core.route import Route
+from deepsimbad.core.route import Route, on_earth
 from deepsimbad_client.errors import MissingExtraError, ReplayError
 from deepsimbad_client.http.models import Belief, NextBestView
 from deepsimbad_client.recordings import Frame

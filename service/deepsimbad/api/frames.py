@@ -29,9 +29,8 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
 from deepsimbad.api.traverses import TraverseName
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import FRAME_NAME, Drive
-from deepsimbad.core.frames import MAX_POSITION_M, content_digest
+from deepsimbad.core.frames import MAX_POSITION_M, Camera, content_digest
 from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.localizer import ready_encodings

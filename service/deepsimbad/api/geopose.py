@@ -8,8 +8,8 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from deepsimbad.api.requests import JsonBody, prefers
-from deepsimbad.core.earth import on_earth
 from deepsimbad.core.map import Map
+from deepsimbad.core.route import on_earth
 from deepsimbad.errors import NotAcceptableError
 
 GEOPOSE = "application/geopose+json"

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from deepsimbad.api.requests import JSON, Services
-from deepsimbad.core.camera import Camera
+from deepsimbad.core.frames import Camera
 from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.worker import Priority
 from deepsimbad.evaluators.base import Evaluator

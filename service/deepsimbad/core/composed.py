@@ -10,7 +10,7 @@ Landmarks begin as frames and are moved to where the sums come nearer still.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numba import njit
@@ -37,6 +37,7 @@ _MOST_FRAMES = 2048  # that principal directions are found from
 class Moments:
     """Running mean and mean square of every number of a row, over the views so far."""
 
+    prior_weight: ClassVar[float] = PRIOR_WEIGHT_FRAMES
     weight: float  # how many views they are worth
     mean: NDArray[np.float64]  # [d]
     square: NDArray[np.float64]  # [d]
@@ -50,7 +51,7 @@ class Moments:
         means = [drive.mean(axis=0, dtype=np.float64) for drive in drives]
         variances = [_telling(drive.var(axis=0, dtype=np.float64)) for drive in drives]
         mean = np.mean(means, axis=0)
-        return cls(PRIOR_WEIGHT_FRAMES, mean, np.mean(variances, axis=0) + np.square(mean))
+        return cls(cls.prior_weight, mean, np.mean(variances, axis=0) + np.square(mean))
 
     @classmethod
     def of_blocks(cls, blocks: Iterable[NDArray[np.float32]]) -> Self:
@@ -62,19 +63,19 @@ class Moments:
             squares = squares + np.einsum("nd,nd->d", block, block, dtype=np.float64)
         mean = total / max(n_frames, 1)
         variance = np.maximum(squares / max(n_frames, 1) - np.square(mean), 0.0)
-        return cls(PRIOR_WEIGHT_FRAMES, mean, _telling(variance) + np.square(mean))
+        return cls(cls.prior_weight, mean, _telling(variance) + np.square(mean))
 
     @classmethod
     def counted(cls, frames: NDArray[np.float32]) -> Self:
         """As they are, to be pooled: what stood still in a few frames may move in others."""
         mean = frames.mean(axis=0, dtype=np.float64)
-        return cls(PRIOR_WEIGHT_FRAMES, mean, frames.var(axis=0, dtype=np.float64) + np.square(mean))
+        return cls(cls.prior_weight, mean, frames.var(axis=0, dtype=np.float64) + np.square(mean))
 
     @classmethod
     def from_mean_std(cls, statistics: NDArray[np.floating]) -> Self:
         """From a map's stored mean and standard deviation, [2, d]."""
         mean, std = statistics.astype(np.float64)
-        return cls(PRIOR_WEIGHT_FRAMES, mean, np.square(std) + np.square(mean))
+        return cls(cls.prior_weight, mean, np.square(std) + np.square(mean))
 
     @cached_property
     def std(self) -> NDArray[np.float64]:

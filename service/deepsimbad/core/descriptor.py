@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from deepsimbad.core.composed import Moments
 from deepsimbad.errors import InvalidDissimilaritiesError, InvalidRankedLandmarksError
 
 MAX_LANDMARKS = 0xFFFF  # landmark ids are uint16 and the last value means "none"
@@ -140,12 +141,10 @@ class ViewScores:
 
 
 @dataclass(frozen=True)
-class LandmarkStatistics:
-    """Running mean and spread of every landmark's normal score, as weighted moments."""
+class LandmarkStatistics(Moments):
+    """Running mean and spread of every landmark's normal score, [r]."""
 
-    weight: float  # how many frames the moments are worth
-    mean: NDArray[np.float64]  # [r] float64, mean normal score
-    square: NDArray[np.float64]  # [r] float64, mean squared normal score
+    prior_weight = PRIOR_WEIGHT_FRAMES
     # [r, q] float32 on common factors, from which landmarks' correlations follow; None: not known, each is taken for
     # itself
     loadings: NDArray[np.float32] | None = None
@@ -154,18 +153,7 @@ class LandmarkStatistics:
     def of_map(cls, ranks: NDArray[np.float32]) -> Self:
         """The statistics of a traverse of ranks [n, r], weighed as the prior of a live session."""
         scores = normal_scores(ranks, ranks.shape[1])
-        return cls(PRIOR_WEIGHT_FRAMES, scores.mean(axis=0), np.square(scores).mean(axis=0))
-
-    @classmethod
-    def from_mean_std(
-        cls,
-        mean: NDArray[np.float64],
-        std: NDArray[np.float64],
-        weight: float = PRIOR_WEIGHT_FRAMES,
-        loadings: NDArray[np.float32] | None = None,
-    ) -> Self:
-        """From a map's stored mean and standard deviation, [r] each, and loadings."""
-        return cls(weight, mean, np.square(std) + np.square(mean), loadings)
+        return cls(cls.prior_weight, scores.mean(axis=0), np.square(scores).mean(axis=0))
 
     @cached_property
     def std(self) -> NDArray[np.float64]:
@@ -189,13 +177,6 @@ class LandmarkStatistics:
         mean = self.mean + (scores - self.mean) * share
         square = self.square + (squares - self.square) * share
         return replace(self, weight=weight, mean=mean, square=square)
-
-    def pooled(self, n_frames: float, other: "LandmarkStatistics", n_others: float) -> Self:
-        """The statistics of two drives together, each counted by its frames; weight and loadings stay this one's."""
-        share = n_others / (n_frames + n_others)
-        mean = self.mean + (other.mean - self.mean) * share
-        square = self.square + (other.square - self.square) * share
-        return replace(self, mean=mean, square=square)
 
     def standardise(self, ranks: NDArray[np.float32]) -> NDArray[np.float64]:
         """z of ranks that are all known, [r] or [n, r]: normal scores less their mean, over their spread.

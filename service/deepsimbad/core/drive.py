@@ -17,7 +17,7 @@ than chance allows, a little. So agreement must also be worth learning from.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from statistics import NormalDist
@@ -26,9 +26,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import LandmarkStatistics, normal_scores, rank_landmarks
-from deepsimbad.core.frames import MAX_POSITION_M, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, content_digest
+from deepsimbad.core.frames import MAX_POSITION_M, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, Camera, content_digest
 from deepsimbad.core.relevance import Query, shows_nothing
 from deepsimbad.core.route import Route, same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMapConfigError, InvalidRouteError
@@ -190,21 +189,12 @@ class Drive:
         encodings = np.asarray(self.encodings, np.float32)
         if encodings.ndim != 2 or encodings.shape[1] == 0:
             raise InvalidEncodingError(f"encodings have shape {encodings.shape}, not [n, d]")
-        frames = replace(
-            self,
-            index=_integers(self.index, "index"),
-            position_m=_reals(self.position_m, "position_m"),
-            timestamp_us=_integers(self.timestamp_us, "timestamp_us"),
-            x_m=_reals(self.x_m, "x_m"),
-            y_m=_reals(self.y_m, "y_m"),
-            frame_name=_texts(self.frame_name, "frame_name"),
-            encodings=encodings,
-        )
+        exact: dict[str, Any] = {name: check(getattr(self, name), name) for name, check in _CHECKED.items()}
+        frames = replace(self, encodings=encodings, **exact)
         n = encodings.shape[0]
-        for name in ("index", "position_m", "timestamp_us", "x_m", "y_m", "frame_name"):
-            shape = getattr(frames, name).shape
-            if shape != (n,):
-                raise InvalidInputError(f"{name} has shape {shape}; there are {n} encodings")
+        for name, array in exact.items():
+            if array.shape != (n,):
+                raise InvalidInputError(f"{name} has shape {array.shape}; there are {n} encodings")
         frames._check_values()
         return frames
 
@@ -263,6 +253,13 @@ def _reals(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     if array.dtype.kind not in "iuf" and array.size:
         raise InvalidInputError(f"{name} holds {array.dtype}, not numbers")
     return array.astype(np.float64, copy=False) + 0.0  # SQLite does not keep the sign of -0.0
+
+
+_CHECKED: Mapping[str, Callable[[NDArray[Any], str], NDArray[Any]]] = {
+    **dict.fromkeys(("index", "timestamp_us"), _integers),
+    **dict.fromkeys(("position_m", "x_m", "y_m"), _reals),
+    "frame_name": _texts,
+}
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.composed import Moments, lengths_of_sums
-from deepsimbad.core.descriptor import MAX_LANDMARKS, PRIOR_WEIGHT_FRAMES, LandmarkStatistics
+from deepsimbad.core.descriptor import MAX_LANDMARKS, LandmarkStatistics
+from deepsimbad.core.frames import Camera
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
 from deepsimbad.core.relevance import (
     DEFAULT_LIKELIHOOD_SCALE,
@@ -330,8 +330,7 @@ class Map:
             None if stored is None else Moments.from_mean_std(stored)
             for stored in (self.usual_encoding, self.usual_product)
         )
-        mean, std = self.statistics
-        ranks = LandmarkStatistics.from_mean_std(mean, std, PRIOR_WEIGHT_FRAMES, self.loadings)
+        ranks = replace(LandmarkStatistics.from_mean_std(self.statistics), loadings=self.loadings)
         return LiveStatistics(ranks, encoding, product)
 
     def is_strange(self, encoding: NDArray[np.float32], live: LiveStatistics | None = None) -> bool:

@@ -200,6 +200,6 @@ class LiveStatistics:
             restored[name] = replace(moments, mean=mean, square=square, weight=arrays[f"{name}_weight"].item())
         return replace(self, **restored)
 
-    def _moments(self) -> dict[str, Moments | LandmarkStatistics]:
+    def _moments(self) -> dict[str, Moments]:
         named = {"ranks": self.ranks, "encodings": self.encodings, "products": self.products}
         return {name: moments for name, moments in named.items() if moments is not None}

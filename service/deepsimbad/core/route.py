@@ -1,5 +1,6 @@
-"""The prelearned route: where along it every map image was taken, and which images show one place (II-C)."""
+"""The prelearned route: where along it, and on Earth, every map image was taken, and which show one place (II-C)."""
 
+import math
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from deepsimbad.errors import InvalidRouteError
 
 _NearPoint = Callable[[float, float], NDArray[np.intp]]
 _HISTOGRAM_BINS = 200
+_EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # of the Earth, by WGS 84
 _LEAST_LENGTH_M = 1e-9  # counted in steps that are far shorter, moves would overflow
 
 
@@ -291,3 +293,24 @@ def _headings(route: Route, over_m: float = 1.0) -> NDArray[np.float64]:
         return np.full(route.n_images, np.nan)
     dx, dy = x[after] - x[before], y[after] - y[before]
     return np.where((dx == 0) & (dy == 0), np.nan, np.arctan2(dy, dx))
+
+
+def on_earth(
+    x_m: float, y_m: float, lat_deg: float, lon_deg: float, bearing_deg: float, height_m: float
+) -> tuple[float, float]:
+    """(latitude, longitude) in degrees, WGS 84, of a place, by the meridian and the parallel through an anchor.
+
+    Args:
+        lat_deg, lon_deg, height_m: Of the origin; metres above the ellipsoid.
+        bearing_deg: Of the axis y, clockwise from north.
+    """
+    turned = math.radians(bearing_deg)
+    east_m = x_m * math.cos(turned) + y_m * math.sin(turned)
+    north_m = y_m * math.cos(turned) - x_m * math.sin(turned)
+    latitude = math.radians(lat_deg)
+    eccentricity = _FLATTENING * (2 - _FLATTENING)
+    bulge = 1 - eccentricity * math.sin(latitude) ** 2
+    meridian_m = _EQUATOR_M * (1 - eccentricity) / bulge**1.5 + height_m
+    parallel_m = (_EQUATOR_M / math.sqrt(bulge) + height_m) * math.cos(latitude)
+    longitude = lon_deg + math.degrees(east_m / max(parallel_m, 1e-6))
+    return lat_deg + math.degrees(north_m / meridian_m), (longitude + 180) % 360 - 180

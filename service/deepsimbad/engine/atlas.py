@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from deepsimbad.core import atlas
-from deepsimbad.core.camera import Camera
+from deepsimbad.core.frames import Camera
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.localizer import Localization, ReadyEncoding, View, describe, localize, ready_encodings

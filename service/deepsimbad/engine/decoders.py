@@ -7,7 +7,7 @@ import numpy as np
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
-from deepsimbad.core.camera import Camera
+from deepsimbad.core.frames import Camera
 from deepsimbad.engine.worker import Priority, ready
 from deepsimbad.errors import OverloadedError
 from deepsimbad.evaluators.base import Evaluator, Image

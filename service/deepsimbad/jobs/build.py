@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.building import Built, MapPlan, SeenTwice, build_from_dissimilarities, compose_map
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.experience.training import LearningCurve, TrainingWorld, train
+from deepsimbad.core.frames import Camera
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.core.route import same_places

@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from deepsimbad.core.building import MapPlan, SeenTwice
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig
+from deepsimbad.core.frames import Camera
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.core.camera import Camera
 from deepsimbad.core.drive import SHOWS_NOTHING, UNLIKE_ALL, Drive
-from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, differences
+from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, UNKNOWN_TIMESTAMP, Camera, differences
 from deepsimbad.core.relevance import shows_nothing
 from deepsimbad.errors import (
     ConflictError,

@@ -7,6 +7,7 @@ cells as map images; where the images stand at equal distances the cells are the
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,8 +25,7 @@ NO_MOVE = np.iinfo(np.int64).min
 """The shift of a first view."""
 
 
-@dataclass(frozen=True)
-class Moves:
+class Moves(NamedTuple):
     """One move of every belief, in cells."""
 
     shift: NDArray[np.int64]  # [e] int64, whole cells, backward ones negative; NO_MOVE: this is a first view
@@ -114,19 +114,8 @@ def step_beliefs(
     """
     ranks = np.empty(len(beliefs))
     true_cell = np.where(true_image >= 0, lattice.cell_of_image[true_image], -1)
-    _step(
-        beliefs,
-        moves.shift,
-        moves.fraction,
-        moves.taps,
-        evidence,
-        lattice.image_of_cell,
-        lattice.images_in_cell,
-        true_cell,
-        lattice.closed,
-        additive,
-        ranks,
-    )
+    cells = lattice.image_of_cell, lattice.images_in_cell, true_cell
+    _step(beliefs, *moves, evidence, *cells, lattice.closed, additive, ranks)
     return ranks
 
 

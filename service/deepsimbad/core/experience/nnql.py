@@ -7,6 +7,7 @@ once its true positions are known: `KnownWalk`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -52,10 +53,8 @@ class NnqlConfig:
             raise InvalidMapConfigError("NNQL needs at least one action, neighbour and episode, and a seed from 0")
         if not all(0 <= share <= 1 for share in shares):
             raise InvalidMapConfigError("NNQL's learning rate, discount, exploration and top share lie within 0 and 1")
-        if (
-            not all(np.isfinite([self.reward, self.initial_q, self.motion_std_m or 0.0]))
-            or (self.motion_std_m or 0) < 0
-        ):
+        std_m = self.motion_std_m or 0.0
+        if not all(np.isfinite([self.reward, self.initial_q, std_m])) or std_m < 0:
             raise InvalidMapConfigError("NNQL's reward, first value and motion deviation must be finite numbers")
 
     def exploration_at(self, episode: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -64,8 +63,7 @@ class NnqlConfig:
         return self.exploration + (self.final_exploration - self.exploration) * done
 
 
-@dataclass(frozen=True)
-class Transitions:
+class Transitions(NamedTuple):
     """Moves whose outcome is known, in the order they are learnt."""
 
     nearest: NDArray[np.int64]  # [t, k] int64, map images most relevant to the view before the move
@@ -90,16 +88,7 @@ def learn(q_values: NDArray[np.float32], moves: Transitions, config: NnqlConfig)
 
     Each of the k entries moves by alpha towards `R + gamma max_a' Q(s', a')`.
     """
-    _learn(
-        q_values,
-        moves.nearest,
-        moves.action,
-        moves.reward,
-        moves.next_nearest,
-        moves.next_allowed,
-        config.learning_rate,
-        config.discount,
-    )
+    _learn(q_values, *moves, config.learning_rate, config.discount)
 
 
 @njit(cache=True, nogil=True)

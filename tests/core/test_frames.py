@@ -1,6 +1,6 @@
 import pytest
 
-from deepsimbad.core.camera import Camera
+from deepsimbad.core.frames import Camera
 
 NCLT = Camera(1232, 1616, "Cam5")
 
