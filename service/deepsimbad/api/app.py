@@ -10,7 +10,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import TimeoutError as TookTooLong
 from contextlib import ExitStack, asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -341,22 +341,16 @@ class Readiness(Answer):
     damaged_maps: Annotated[list[str], Field(description="Domains whose active map cannot be loaded.")]
 
 
+@dataclass(eq=False)
 class ReadinessCheck:
-    """What keeps the service from doing what it is there for, told by trying, at most once a second; from any thread.
+    """What keeps the service from doing what it is there for; told by trying, once a second at most, in any thread."""
 
-    Args:
-        catalog: Read.
-        sessions: Read and written.
-        threads: What must be alive, by a name that a person understands.
-    """
-
-    def __init__(self, catalog: Catalog, sessions: SessionStore, threads: Mapping[str, Callable[[], bool]]) -> None:
-        self._catalog = catalog
-        self._sessions = sessions
-        self._threads = threads
-        self._lock = threading.Lock()
-        self._looked_at = -math.inf
-        self._faults: tuple[str, ...] = ()
+    catalog: Catalog
+    sessions: SessionStore
+    threads: Mapping[str, Callable[[], bool]]  # what must be alive, by a name that a person understands
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _looked_at: float = -math.inf
+    _faults: tuple[str, ...] = ()
 
     def faults(self) -> tuple[str, ...]:
         """One sentence for everything that is wrong; none where the service is ready. May wait for the disk."""
@@ -367,21 +361,19 @@ class ReadinessCheck:
             return self._faults
 
     def _look(self) -> list[str]:
-        faults = [
-            f"{name} has ended: restart the service" for name, is_alive in self._threads.items() if not is_alive()
-        ]
+        faults = [f"{name} has ended: restart the service" for name, is_alive in self.threads.items() if not is_alive()]
 
         def write() -> None:
-            self._sessions.try_writing().result(_WRITE_TIMEOUT_S)
+            self.sessions.try_writing().result(_WRITE_TIMEOUT_S)
 
-        for look in (self._catalog.check, self._sessions.check, write):
+        for look in (self.catalog.check, self.sessions.check, write):
             try:
                 look()
             except DeepSimbadError as error:
                 faults.append(error.message)
             except TookTooLong:
                 faults.append(f"sessions.sqlite: a write takes longer than {_WRITE_TIMEOUT_S:g} s")
-        return [*faults, *_disk_faults(self._catalog.data_dir)]
+        return [*faults, *_disk_faults(self.catalog.data_dir)]
 
 
 def _disk_faults(data_dir: Path) -> list[str]:

@@ -60,11 +60,7 @@ class CoverageAnswer(TypedDict):
 
 
 @router.get("/{domain}/coverage", response_model=CoverageAnswer, responses=problems(404, 409, 410, 422))
-async def get_coverage(
-    domain: DomainName,
-    running: Running,
-    map_version: PinnedVersion = None,
-) -> Response:
+async def get_coverage(domain: DomainName, running: Running, map_version: PinnedVersion = None) -> Response:
     """For every map image the chance that a single view there is placed rightly; worst stretches first."""
     snapshot = await _snapshot(running, domain, map_version)
     record = await run_sync(running.catalog.map, domain, snapshot.version)

@@ -22,25 +22,9 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import Scope
 
+from deepsimbad import errors
 from deepsimbad.api.keys import needed_scope
-from deepsimbad.errors import (
-    AccessError,
-    BusyError,
-    CancelledError,
-    ConflictError,
-    DeepSimbadError,
-    ForbiddenError,
-    GoneError,
-    InvalidInputError,
-    NotAcceptableError,
-    NotFoundError,
-    OverloadedError,
-    SettingsError,
-    TooLargeError,
-    UnavailableError,
-    UnreadableRequestError,
-    UnsupportedMediaTypeError,
-)
+from deepsimbad.errors import DeepSimbadError, InvalidInputError, OverloadedError
 
 log = logging.getLogger(__name__)
 
@@ -49,20 +33,20 @@ RETRY_AFTER_S = 5
 
 # Looked up along an error's bases, nearest first, so a branch may hold an exception to its parent's rule.
 STATUS_OF_BRANCH: Mapping[type[BaseException], HTTPStatus] = {
-    SettingsError: HTTPStatus.INTERNAL_SERVER_ERROR,
-    InvalidInputError: HTTPStatus.UNPROCESSABLE_ENTITY,
-    AccessError: HTTPStatus.UNAUTHORIZED,
-    ForbiddenError: HTTPStatus.FORBIDDEN,
-    NotFoundError: HTTPStatus.NOT_FOUND,
-    NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
-    UnreadableRequestError: HTTPStatus.BAD_REQUEST,
-    ConflictError: HTTPStatus.CONFLICT,
-    CancelledError: HTTPStatus.CONFLICT,
-    GoneError: HTTPStatus.GONE,
-    BusyError: HTTPStatus.TOO_MANY_REQUESTS,
-    TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-    UnsupportedMediaTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
-    UnavailableError: HTTPStatus.SERVICE_UNAVAILABLE,
+    errors.SettingsError: HTTPStatus.INTERNAL_SERVER_ERROR,
+    errors.InvalidInputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    errors.AccessError: HTTPStatus.UNAUTHORIZED,
+    errors.ForbiddenError: HTTPStatus.FORBIDDEN,
+    errors.NotFoundError: HTTPStatus.NOT_FOUND,
+    errors.NotAcceptableError: HTTPStatus.NOT_ACCEPTABLE,
+    errors.UnreadableRequestError: HTTPStatus.BAD_REQUEST,
+    errors.ConflictError: HTTPStatus.CONFLICT,
+    errors.CancelledError: HTTPStatus.CONFLICT,
+    errors.GoneError: HTTPStatus.GONE,
+    errors.BusyError: HTTPStatus.TOO_MANY_REQUESTS,
+    errors.TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    errors.UnsupportedMediaTypeError: HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+    errors.UnavailableError: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 
 # The titles of answers that no error of ours stands behind.

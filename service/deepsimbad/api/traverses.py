@@ -23,11 +23,7 @@ from deepsimbad.api.requests import (
     page_of,
     read_json,
 )
-from deepsimbad.errors import (
-    ConflictError,
-    TraverseInUseError,
-    UnknownTraverseError,
-)
+from deepsimbad.errors import ConflictError, TraverseInUseError, UnknownTraverseError
 from deepsimbad.evaluators.grey_levels import DEEPEST, GreyLevels
 from deepsimbad.jobs.versions import TRAVERSE_ROLES
 from deepsimbad.store.records import ListPage

@@ -16,12 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.errors import (
-    InvalidArchiveError,
-    InvalidEncodingError,
-    InvalidMapConfigError,
-    TooFewCandidatesError,
-)
+from deepsimbad.errors import InvalidArchiveError, InvalidEncodingError, InvalidMapConfigError, TooFewCandidatesError
 
 _BLOCK = 1536  # candidates a side of one block of products: 9 MB, and large enough for the full speed of BLAS
 _ABOUT = ("evaluator", "map_version", "n_landmarks", "weights_sha256")
@@ -29,9 +24,7 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # a zip's earliest time: the same model is the s
 
 
 def select_landmarks(
-    candidates: NDArray[np.float32],
-    n_landmarks: int,
-    on_progress: Callable[[float], None] | None = None,
+    candidates: NDArray[np.float32], n_landmarks: int, on_progress: Callable[[float], None] | None = None
 ) -> NDArray[np.int64]:
     """[r] the candidates [n, d] farthest from their nearest other candidate, best first, ties by index.
 

@@ -35,14 +35,7 @@ from deepsimbad.errors import (
     UnknownSessionError,
 )
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.store.sessions import (
-    IdempotencyKey,
-    JournalRow,
-    PriorRow,
-    SessionRecord,
-    SessionStore,
-    StateSnapshot,
-)
+from deepsimbad.store.sessions import IdempotencyKey, JournalRow, PriorRow, SessionRecord, SessionStore, StateSnapshot
 
 DEFAULT_START_STD_M = 5.0
 _LONGEST_MOVE_ACTIONS = 10.0  # a robot may report a move of up to so many of the domain's longest action

@@ -84,11 +84,7 @@ class Truths:
     """Replays sessions, living ones and those that ended and are still known; used from an event loop."""
 
     def __init__(
-        self,
-        store: SessionStore,
-        worker: InferenceWorker,
-        sessions: Sessions,
-        clock: Callable[[], float] = time.time,
+        self, store: SessionStore, worker: InferenceWorker, sessions: Sessions, clock: Callable[[], float] = time.time
     ) -> None:
         self._store = store
         self._worker = worker

@@ -4,7 +4,6 @@ A text is read clause by clause, and is the mean of what these say: in which ord
 many sentences that takes, then counts for nothing (docs/language.md has what this gains).
 """
 
-import hashlib
 import re
 import threading
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.nets.sentence_bert import SentenceBert
 from deepsimbad.evaluators.scenes import Form, Scene
+from deepsimbad.evaluators.weights.files import file_sha256
 
 _CLAUSE_ENDS = re.compile(r"[,.;:!?\n\u3001\u3002\uff0c]+(?:\s+|$)|(?<=[\u3001\u3002\uff0c])")
 INSTALL = "pip install 'deep-simbad[language]'"
@@ -71,8 +71,7 @@ class Language(FeatureL2):
         with self._reading:
             if self._read is None:
                 folder = self._folder()
-                digest = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
-                self._read = SentenceBert(folder), digest
+                self._read = SentenceBert(folder), file_sha256(folder / "model.safetensors")
             return self._read
 
     def _folder(self) -> Path:

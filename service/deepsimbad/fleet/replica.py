@@ -113,10 +113,7 @@ class Replica:
         if number is not None:
             settings = settings.model_copy(update={"data_dir": administrator_folder(settings.data_dir, number)})
             elsewhere = replace(
-                elsewhere,
-                sessions=partial(AllSessions.sharing, objects),
-                administrator=number,
-                newest_jobs=jobs.newest,
+                elsewhere, sessions=partial(AllSessions.sharing, objects), administrator=number, newest_jobs=jobs.newest
             )
         else:
             folder = _new_folder()

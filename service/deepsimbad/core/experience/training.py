@@ -237,10 +237,7 @@ def walk_greedily(
 
 
 def choose_actions(
-    values: NDArray[np.float64],
-    allowed: NDArray[np.bool_],
-    exploration: NDArray[np.float64],
-    rng: np.random.Generator,
+    values: NDArray[np.float64], allowed: NDArray[np.bool_], exploration: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Epsilon-greedy moves, ties broken at random.
 

@@ -30,17 +30,14 @@ class SentenceBert:
                 f"a package that language needs cannot be imported: {error}: pip install 'deep-simbad[language]'"
             ) from error
         try:
-            self._config: dict[str, Any] = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+            self._config = _told_in(folder / "config.json")
             pooling = folder / "1_Pooling" / "config.json"
-            by_mean = (
-                not pooling.exists() or json.loads(pooling.read_text(encoding="utf-8"))["pooling_mode_mean_tokens"]
-            )
+            by_mean = not pooling.exists() or _told_in(pooling)["pooling_mode_mean_tokens"]
             self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
             self._tokenizer.no_padding()
             self._tokenizer.no_truncation()
-            self._weights = {
-                name.removeprefix("bert."): w for name, w in load_file(folder / "model.safetensors").items()
-            }
+            weights = load_file(folder / "model.safetensors")
+            self._weights = {name.removeprefix("bert."): tensor for name, tensor in weights.items()}
             if self._config["model_type"] != "bert" or not by_mean:
                 raise InvalidWeightsError(
                     f"{folder.name} is no BERT whose pieces are averaged: other models are not read"
@@ -101,3 +98,7 @@ class SentenceBert:
 
         scale, shift = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
         return layer_norm(x, scale.shape, scale, shift, float(self._config["layer_norm_eps"]))
+
+
+def _told_in(file: Path) -> dict[str, Any]:
+    return dict(json.loads(file.read_text(encoding="utf-8")))

@@ -315,8 +315,7 @@ class _Download:
             )
 
     def _finish(self) -> str:
-        with self._part.open("rb") as stream:
-            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        sha256 = file_sha256(self._part)
         if not matches(sha256, self._sha256):
             self._forget()
         check_digest(self._to.name, sha256, self._sha256, f"what {self._url} sent was not kept")
