@@ -40,6 +40,7 @@ INSTALL_TORCH = (
 INSTALL_FAST = "install ONNX Runtime: pip install 'deep-simbad[fast]'"
 
 _INPUT = "pixels"
+_LARGE = ("trunk", "whitening")  # children of a network that are cast
 _DIGEST_BYTES = 32
 _BATCH_ON_CPU = 1  # a larger one leaves the caches: docs/results/encode.md
 _BATCH_ON_CUDA = 32
@@ -70,8 +71,8 @@ def make_run(
     """Make a network ready.
 
     Args:
-        make_module: Makes the module, in float32, its trunk under the name `trunk`; not called where an export of it is
-            at hand.
+        make_module: Makes the module, in float32; its children `trunk` and `whitening` bear bfloat16. Not called where
+            an export of it is at hand.
         compute: How it should be run.
         example: (width, height) of an input, for the export.
         exported_as: Name that stands for this very module with these very weights; None: ONNX Runtime is not for it.
@@ -127,7 +128,7 @@ def _has_bf16_units() -> bool:
 
 
 class _TorchRun:
-    """A module on a device, its trunk in float32 or bfloat16."""
+    """A module on a device, its large parts in float32 or bfloat16."""
 
     def __init__(self, module: "nn.Module", in_bf16: bool, device: str, compute: Compute) -> None:
         import torch
@@ -135,8 +136,9 @@ class _TorchRun:
         self._torch, self._device = torch, device
         torch.set_num_threads(compute.n_threads or available_cores())
         module.eval().requires_grad_(False)
-        if in_bf16:
-            module.trunk.to(torch.bfloat16)
+        for name, part in module.named_children():
+            if in_bf16 and name in _LARGE:
+                part.to(torch.bfloat16)
         with named_lack_of_memory("encode"):
             self._module = module.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.largest_batch = compute.largest_batch or (_BATCH_ON_CPU if device == "cpu" else _BATCH_ON_CUDA)
