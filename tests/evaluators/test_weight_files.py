@@ -16,7 +16,7 @@ from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.extractors.netvlad import netvlad
 from deepsimbad.evaluators.extractors.squeezenet import squeezenet
-from deepsimbad.evaluators.weights.matlab_struct import read_variable
+from deepsimbad.evaluators.weights.files import read_variable
 
 from . import references
 from .references import NETVLAD_WRITERS, SQUEEZENET_WRITERS, random_network, random_squeezenet

@@ -32,8 +32,8 @@ from tests.fleet.running import running
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
     from deepsimbad.fleet import backend
     from deepsimbad.fleet.backend import Backend, Gone
-    from deepsimbad.fleet.lists import AllJobs
     from deepsimbad.fleet.owners import Administrators
+    from deepsimbad.fleet.replica import AllJobs
 
 
 def of_fleet(test):

@@ -52,7 +52,7 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
 
 
 def _module(path: Path) -> "nn.Module":
-    from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
+    from deepsimbad.evaluators.extractors.networks import SpatialGrid
 
     weights = read_squeezenet(path)
     preset = weights.preset
@@ -87,7 +87,7 @@ class SqueezeNetWeights:
 
     def trunk(self, taken: tuple[int, ...]) -> "nn.Module":
         """The network of these weights up to the last fire module taken; raises InvalidWeightsError."""
-        from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
+        from deepsimbad.evaluators.extractors.networks import SqueezeNet
 
         trunk = SqueezeNet(taken)
         fill(trunk, self.tensors, self.file)

@@ -2,12 +2,17 @@
 
 import hashlib
 import pickle
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
+from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
 
@@ -16,6 +21,18 @@ if TYPE_CHECKING:
 
 _MOST_BYTES = 4 << 30  # unpacked; the largest of the known files holds half a gigabyte
 _MOST_RATIO = 20  # weights hardly compress: more is a file made to fill the memory
+MATLAB_MAGIC = b"MATLAB"
+_MATLAB_5 = b"MATLAB 5.0 MAT-file"
+_HEADER_BYTES = 128
+_MOST_PARTS = 100_000  # the known files have some hundreds
+_DEEPEST = 12
+_CHUNK = 16 << 20
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCT, _CHAR = 1, 2, 4
+_NUMBERS = range(6, 16)  # double, single and integers
+_STORED: dict[int, str] = {
+    1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8",
+}  # fmt: skip
 
 
 def weights_path(folder: Path, name: str) -> Path:
@@ -122,3 +139,163 @@ def check_size(path: Path) -> None:
         raise InvalidWeightsError(
             f"{path.name} unpacks to {unpacked} bytes, more than any file of weights", file=path.name
         )
+
+
+def read_variable(path: Path, name: str) -> Any:
+    """A variable of a MATLAB file of version 5 (also `save -v6` and `-v7`): numbers, texts, cells and structs.
+
+    SciPy's reader is not used: it follows cells inside cells by recursion in C, so that a file of a few megabytes ends
+    the process, and it unpacks without a bound. Format: MathWorks, "MAT-File Format", chapter 1.
+
+    Returns:
+        Structs as dicts, cells as lists (column by column), numbers as arrays in MATLAB's order of axes, texts as str;
+        None for what is none of these (objects, functions, complex and sparse matrices, arrays of structs): it is
+        passed over.
+
+    Raises:
+        InvalidWeightsError: Truncated, no such file, too large unpacked, nested too deeply, or without that variable.
+    """
+    with path.open("rb") as stream:
+        header = stream.read(_HEADER_BYTES)
+        if not header.startswith(_MATLAB_5) or header[126:128] != b"IM":
+            raise InvalidWeightsError(
+                f"{path.name} is no MATLAB file of version 5: save it with -v7 on a little-endian machine",
+                file=path.name,
+            )
+        unpacked = min(_MOST_BYTES, _MOST_RATIO * path.stat().st_size)
+        while tag := stream.read(8):
+            if len(tag) < 8:
+                _refuse(path.name)
+            kind, n_bytes = struct.unpack("<II", tag)
+            body = _body(stream, kind, n_bytes, unpacked, path.name)
+            unpacked -= len(body)
+            variable = _Reader(body, path.name).variable()
+            if variable.name == name:
+                return variable.value
+    raise InvalidWeightsError(f"{path.name} has no variable {name}: it is of another network", file=path.name)
+
+
+def _body(stream: BinaryIO, kind: int, n_bytes: int, most: int, file: str) -> bytearray:
+    """What a top-level element holds, without its tag, unpacked."""
+    if kind not in {_MATRIX, _COMPRESSED}:
+        _refuse(file)
+    unpack = zlib.decompressobj() if kind == _COMPRESSED else None
+    body = bytearray()
+    while n_bytes:
+        chunk = stream.read(min(n_bytes, _CHUNK))
+        if not chunk:
+            _refuse(file)
+        n_bytes -= len(chunk)
+        try:
+            body += chunk if unpack is None else unpack.decompress(chunk, most - len(body) + 1)
+        except (zlib.error, MemoryError) as error:
+            raise InvalidWeightsError(f"{file} is damaged, or does not fit the memory", file=file) from error
+        if len(body) > most or (unpack is not None and unpack.unconsumed_tail):
+            raise InvalidWeightsError(f"{file} unpacks to more than any file of weights", file=file)
+    if unpack is None:
+        return body
+    if not unpack.eof or len(body) < 8 or struct.unpack_from("<I", body) != (_MATRIX,):
+        _refuse(file)
+    del body[:8]
+    return body
+
+
+def _refuse(file: str) -> NoReturn:
+    raise InvalidWeightsError(f"{file} is no whole MATLAB file", file=file)
+
+
+@dataclass(frozen=True)
+class _Variable:
+    name: str
+    value: Any
+
+
+class _Reader:
+    """Walks the elements of one variable; every step is checked against the end of what holds it."""
+
+    def __init__(self, body: bytearray, file: str) -> None:
+        self._body, self._view, self._file = body, memoryview(body), file
+        self._n_parts = 0
+
+    def variable(self) -> _Variable:
+        """The variable."""
+        try:
+            return self._matrix(0, len(self._body), 0)
+        except (struct.error, ValueError, IndexError) as error:
+            raise InvalidWeightsError(f"{self._file} is no whole MATLAB file", file=self._file) from error
+
+    def _matrix(self, at: int, end: int, depth: int) -> _Variable:
+        """The array between two places: flags, dimensions, name, then what its class says."""
+        self._n_parts += 1
+        if depth > _DEEPEST or self._n_parts > _MOST_PARTS:
+            raise InvalidWeightsError(
+                f"{self._file} is nested deeper, or in more parts, than any file of weights", file=self._file
+            )
+        if at == end:
+            return _Variable("", np.empty(0))  # MATLAB's own form of an empty cell
+        flags, at = self._numbers(at, end)
+        sizes, at = self._numbers(at, end)
+        name, at = self._numbers(at, end)
+        kind, is_complex = int(flags[0]) & 0xFF, bool(int(flags[0]) & 0x800)
+        shape = tuple(int(size) for size in sizes)
+        if min(shape, default=-1) < 0:
+            _refuse(self._file)
+        value: Any = None
+        if kind == _CELL:
+            value = [item.value for item in self._matrices(at, end, prod(shape), depth)]
+        elif kind == _STRUCT and prod(shape) == 1:
+            value = self._struct(at, end, depth)
+        elif kind == _CHAR:
+            value = self._text(at, end)
+        elif kind in _NUMBERS and not is_complex:
+            numbers, _ = self._numbers(at, end)
+            value = numbers.reshape(shape, order="F")
+        return _Variable(bytes(name).decode("latin-1"), value)
+
+    def _struct(self, at: int, end: int, depth: int) -> dict[str, Any]:
+        widths, at = self._numbers(at, end)
+        texts, at = self._numbers(at, end)
+        width, joined = int(widths[0]), bytes(texts)
+        if width <= 0 or len(joined) % width:
+            _refuse(self._file)
+        fields = [joined[i : i + width].partition(b"\0")[0].decode("latin-1") for i in range(0, len(joined), width)]
+        values = self._matrices(at, end, len(fields), depth)
+        return {field: item.value for field, item in zip(fields, values, strict=True)}
+
+    def _matrices(self, at: int, end: int, count: int, depth: int) -> list[_Variable]:
+        if count > _MOST_PARTS:
+            _refuse(self._file)
+        matrices = []
+        for _ in range(count):
+            kind, start, stop, following = self._element(at, end)
+            if kind != _MATRIX:
+                _refuse(self._file)
+            matrices.append(self._matrix(start, stop, depth + 1))
+            at = following
+        return matrices
+
+    def _text(self, at: int, end: int) -> str:
+        kind, start, stop, _ = self._element(at, end)
+        return bytes(self._view[start:stop]).decode({16: "utf-8", 17: "utf-16-le", 4: "utf-16-le"}.get(kind, "latin-1"))
+
+    def _numbers(self, at: int, end: int) -> tuple[NDArray[Any], int]:
+        """The numbers of an element, as a view, and where the next one begins."""
+        kind, start, stop, following = self._element(at, end)
+        if kind not in _STORED:
+            _refuse(self._file)
+        if start == stop:
+            return np.empty(0, _STORED[kind]), following
+        return np.frombuffer(self._view[start:stop], _STORED[kind]), following
+
+    def _element(self, at: int, end: int) -> tuple[int, int, int, int]:
+        """(type, first byte, byte behind the last, byte of the next element) of the element at a place."""
+        (word,) = struct.unpack_from("<I", self._view[:end], at)
+        if word >> 16:  # up to four bytes lie in the tag itself
+            kind, start, n_bytes, following = word & 0xFFFF, at + 4, word >> 16, at + 8
+        else:
+            kind, n_bytes = struct.unpack_from("<II", self._view[:end], at)
+            start = at + 8
+            following = start + n_bytes + -n_bytes % 8
+        if start + n_bytes > end:
+            _refuse(self._file)
+        return kind, start, start + n_bytes, following
