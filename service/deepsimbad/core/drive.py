@@ -40,9 +40,8 @@ UNLIKE_ALL = "are so unlike all others that they may show nothing of the route: 
 _ROWS_AT_ONCE, _NAMED = 1024, 3
 
 SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
-LEAST_CORRELATION = (
-    0.2  # mean, of scores at equal positions; where scenery repeats, chance goes far, but rarely this far
-)
+# Mean, of scores at equal positions; where scenery repeats, chance goes far, but rarely this far
+LEAST_CORRELATION = 0.2
 LEAST_PLACES = 30  # that both saw
 _STATION_M = 1.0  # frames nearer together, as of a robot that stands, say nothing new
 _FEWEST_STATIONS, _MOST_STATIONS = 64, 512  # a short route is cut finer, a long one coarser

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import is_not
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -190,13 +191,9 @@ class Atlas:
     def _atlas_of(self, snapshots: list[Map]) -> atlas.Atlas:
         with self._lock:
             last = self._asked
-            if last is None or len(last.maps) != len(snapshots) or any(map(_differ, last.maps, snapshots)):
+            if last is None or len(last.maps) != len(snapshots) or any(map(is_not, last.maps, snapshots)):
                 last = self._asked = atlas.Atlas(snapshots)
             return last
-
-
-def _differ(one: Map, other: Map) -> bool:
-    return one is not other
 
 
 def _takes(snapshot: Map, view: View, encoding: np.ndarray) -> bool:

@@ -16,10 +16,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deepsimbad.core.drive import MAX_NAME_LENGTH, Drive
-from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.errors import DeepSimbadError, InvalidBatchError, SpoolFullError, TooLargeError, UnknownTraverseError
 from deepsimbad.store.traverses import Traverse
 
@@ -145,17 +143,7 @@ def read_batch(file: IO[bytes], max_bytes: int) -> Drive:
         raise
     except Exception as error:  # zipfile and numpy raise some ten kinds over a file that was meddled with
         raise InvalidBatchError("the batch is not a whole npz file as numpy.savez writes it") from error
-    n_frames = len(arrays["encodings"])
-    unknown = np.full(n_frames, np.nan)
-    return Drive(
-        index=arrays["index"],
-        position_m=arrays["position_m"],
-        timestamp_us=arrays.get("timestamp_us", np.full(n_frames, UNKNOWN_TIMESTAMP)),
-        x_m=arrays.get("x_m", unknown),
-        y_m=arrays.get("y_m", unknown),
-        frame_name=arrays.get("name", np.full(n_frames, "")),
-        encodings=arrays["encodings"],
-    )
+    return Drive(**{"frame_name" if name == "name" else name: array for name, array in arrays.items()})
 
 
 def _check_directory(file: IO[bytes]) -> None:
@@ -172,7 +160,7 @@ def _check_directory(file: IO[bytes]) -> None:
         raise InvalidBatchError(f"the batch holds more than the arrays {', '.join(MEMBERS)}", allowed=list(MEMBERS))
 
 
-def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, NDArray[Any]]:
+def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, Any]:
     members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
     if not set(members) <= set(MEMBERS) or len(members) != len(archive.infolist()):
         what = f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}"

@@ -31,14 +31,7 @@ _PNG_PICTURE = frozenset({b"IHDR", b"PLTE", b"tRNS", b"eXIf", b"IDAT", b"IEND"})
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _PNG_UNPACKED = 1 << 18  # bytes of picture data: what is packed in less keeps a decoder for a quarter of a second
 _TIFF_FIELD_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 18: 8}
-_TIFF_FORMATS = {
-    1: "B",
-    3: "H",
-    4: "I",
-    13: "I",
-    16: "Q",
-    18: "Q",
-}  # the integer types: BYTE, SHORT, LONG, IFD, 8 bytes
+_TIFF_FORMATS = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}  # the integers: BYTE, SHORT, LONG, IFD, 8 bytes
 _TIFF_SIZES = (256, 257, 322, 323, 277)  # width and height, those of tiles, samples of a pixel
 _TIFF_PARTS = ((273, 279), (324, 325))  # offsets and byte counts of strips, of tiles
 _TIFF_BITS, _TIFF_ORIENTATION = 258, 274

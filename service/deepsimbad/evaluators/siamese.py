@@ -7,6 +7,7 @@ goes back to plain L2 where it is no better on stretches that nothing was chosen
 
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -123,11 +124,7 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
             optimiser.step()
             losses.append(float(loss.detach()))
         now = {name: layer.detach().numpy().astype(np.float16).astype(np.float32) for name, layer in layers.items()}
-        scores = PairScores.of(
-            units,
-            split.validation,
-            lambda x, now=now: _dissimilarities(x, units.prototypes, now),  # type: ignore[misc]
-        )
+        scores = PairScores.of(units, split.validation, partial(_dissimilarities, p=units.prototypes, trained=now))
         plain = plain or now
         if not best or scores.anr < min(point["anr"] for point in curve):
             best = now

@@ -231,17 +231,8 @@ class Trunk(OwnDissimilarities, FeatureL2):
             lit += [np.ones(len(frames), np.bool_)] * 2
         n_queries, n_second = sum(map(len, queries)), len(lesson.places) if lesson.other is not None else 0
         is_judge = np.arange(n_queries) < n_second if n_second else np.concatenate(lit)
-        return model, UnitLesson(
-            u,
-            lesson.landmarks,
-            np.concatenate(queries),
-            np.concatenate(true).astype(np.int64),
-            np.concatenate(weight),
-            is_judge,
-            n_second > 0,
-            position_m,
-            step_m,
-        )
+        views = np.concatenate(queries), np.concatenate(true).astype(np.int64), np.concatenate(weight)
+        return model, UnitLesson(u, lesson.landmarks, *views, is_judge, n_second > 0, position_m, step_m)
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:
         """See `Evaluator.check_model`: every array is there, finite, and its axes agree."""

@@ -218,12 +218,10 @@ class _FetchedFolder(FolderRecording):
     url: str
 
     def stamp(self, frame: Frame) -> str:
-        """See `Recording.stamp`."""
         self._fetch(frame)
         return super().stamp(frame)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
-        """See `Recording.image`."""
         self._fetch(frame)
         return super().image(frame, input_size)
 

@@ -16,7 +16,7 @@ from deepsimbad.settings import Settings
 
 
 class Encoder:
-    """The deployment: evaluators as they are asked for, and the service's worker, with its two settings of batches."""
+    """The deployment, asked as an `engine.distant.Encoder`: evaluators as they are asked for, and one worker."""
 
     def __init__(self, settings: Settings) -> None:
         configure_logging(settings.log_level)
@@ -32,7 +32,6 @@ class Encoder:
             raise RuntimeError("the inference worker has ended")
 
     async def lives(self, seconds: float) -> None:
-        """See `Backend`."""
         await asyncio.sleep(seconds)
 
     async def ask(self, method: str, *arguments: Any) -> Any:
@@ -43,17 +42,14 @@ class Encoder:
             return error.with_traceback(None)
 
     async def facts(self, config: EvaluatorConfig) -> NetworkFacts:
-        """See `engine.distant.Encoder`."""
         evaluator = self._of(config)
         await asyncio.to_thread(evaluator.load)
         return NetworkFacts.of(evaluator)
 
     async def prepared(self, config: EvaluatorConfig, image: Image) -> Image:
-        """See `engine.distant.Encoder`."""
         return await asyncio.to_thread(ready(self._of(config)).prepare, image)
 
     async def encoded(self, config: EvaluatorConfig, view: Image | Scene, priority: Priority) -> EncodedImage:
-        """See `engine.distant.Encoder`."""
         evaluator = await asyncio.to_thread(ready, self._of(config))
         return await asyncio.wrap_future(self._worker.encode(evaluator, view, priority))
 
@@ -68,15 +64,12 @@ class AskedEncoder:
         self._backend, self._loop = backend, loop
 
     def facts(self, config: EvaluatorConfig) -> Future[NetworkFacts]:
-        """See `engine.distant.Encoder`."""
         return self._promised("facts", config)
 
     def prepared(self, config: EvaluatorConfig, image: Image) -> Future[Image]:
-        """See `engine.distant.Encoder`."""
         return self._promised("prepared", config, image)
 
     def encoded(self, config: EvaluatorConfig, view: Image | Scene, priority: Priority) -> Future[EncodedImage]:
-        """See `engine.distant.Encoder`."""
         return self._promised("encoded", config, view, priority)
 
     def _promised(self, method: str, *arguments: Any) -> Future[Any]:

@@ -34,7 +34,6 @@ class AskedOwners:
         self._replicas = replicas
 
     async def gather(self, names: Sequence[str], is_all: bool) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
-        """See `engine.atlas.Owners`."""
         there, left_out = list[MappedDomain](), dict[str, DeepSimbadError]()
         for asked, answer in await self._answers({name: name for name in names}, "gathered", is_all):
             if isinstance(answer, UnavailableError):
@@ -49,7 +48,6 @@ class AskedOwners:
     async def ask(
         self, domains: Sequence[MappedDomain], view: View, n_in_full: int, n_shortlist: int | None
     ) -> list[Part]:
-        """See `engine.atlas.Owners`."""
         members = {mapped.record.name: mapped for mapped in domains}
         return [
             Part({}, {}, dict.fromkeys(asked, answer)) if isinstance(answer, DeepSimbadError) else answer
