@@ -8,16 +8,7 @@ import pytest
 from deepsimbad.core.atlas import posterior
 from deepsimbad.store.records import KeyScope
 
-from .conftest import (
-    JPEG,
-    JSON,
-    TAKES_ENCODINGS,
-    encoded,
-    picture,
-    problem,
-    ready_encodings,
-    service,
-)
+from .conftest import JPEG, JSON, TAKES_ENCODINGS, encoded, picture, problem, ready_encodings, service
 
 URL = "/v1/localizations"
 FAR = 30.0  # how differently the other route looks

@@ -5,13 +5,15 @@ from pathlib import Path
 import pytest
 
 from bench.measurement import breaches
+from bench.soak import trial
 from bench.soak.__main__ import limits, report
 from bench.soak.actor import LostError, expect
 from bench.soak.trial import Soak, soak
 
 
 @pytest.mark.slow
-def test_a_few_kills(tmp_path: Path) -> None:
+def test_a_few_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "LONGEST_LIFE_S", 1.0)
     result = soak(tmp_path / "data", n_kills=3, seed=2)
     assert len(result.ready_s) == len(result.empty_ready_s) == 3, "it was ready again every time"
     assert all(result.n_acknowledged[who] for who in ("Robot", "Uploader", "Mapper"))

@@ -62,12 +62,7 @@ def map_contents(
             build_map(relevance, drive, LIST_LENGTH, closed), actions_m=np.array([1.0, 2.0]), landmark_model=model
         )
     return replace(
-        map_,
-        domain=domain,
-        version=version,
-        created_at="2026-01-01T00:00:00Z",
-        evaluator=EVALUATOR,
-        index_bytes=1200,
+        map_, domain=domain, version=version, created_at="2026-01-01T00:00:00Z", evaluator=EVALUATOR, index_bytes=1200
     )
 
 

@@ -13,13 +13,7 @@ import pytest
 from deepsimbad.engine import maps as maps_module
 from deepsimbad.engine.maps import Maps, Retention, beyond_keeping
 from deepsimbad.engine.session import SessionConfig
-from deepsimbad.errors import (
-    DamagedMapError,
-    MapInUseError,
-    NoActiveMapError,
-    RetiredMapError,
-    UnavailableError,
-)
+from deepsimbad.errors import DamagedMapError, MapInUseError, NoActiveMapError, RetiredMapError, UnavailableError
 from deepsimbad.store import catalog_maps
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY

@@ -28,6 +28,7 @@ def robot(service: Service, told: Told, ended: threading.Event) -> None:
     while not ended.is_set():
         view = told.views[session_id]
         told.views[session_id] = service.told("POST", **service.observe(session_id, view))["n_observations"]
+        ended.wait(0.02)  # or no job gets anywhere
 
 
 def uploader(service: Service, told: Told, ended: threading.Event) -> None:

@@ -60,13 +60,7 @@ def test_a_data_directory_that_cannot_be_made_is_named(read_only: Path) -> None:
     assert ran.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("delete-domain", "loop", "--yes"),
-        ("keys", "create", "--scope", "admin"),
-    ],
-)
+@pytest.mark.parametrize("arguments", [("delete-domain", "loop", "--yes"), ("keys", "create", "--scope", "admin")])
 def test_who_would_write_is_told_in_one_line(read_only: Path, arguments: tuple[str, ...]) -> None:
     ran = unprivileged(*arguments, "--data-dir", read_only)
     assert "may not be written" in ran.line or "cannot be opened" in ran.line

@@ -36,10 +36,7 @@ def test_nothing_is_acknowledged_into_a_file_that_is_gone(data_dir: Path) -> Non
     with Service(data_dir) as service:
         session_id = begin(service)
         (data_dir / "sessions.sqlite").unlink()
-        for request in (
-            service.observe(session_id, 3),
-            {"path": "/v1/domains/loop/sessions", "json": {}},
-        ):
+        for request in (service.observe(session_id, 3), {"path": "/v1/domains/loop/sessions", "json": {}}):
             problem = service.refused("POST", **request)
             assert (problem["status"], problem["code"]) == (503, "damaged_file")
             assert "sessions.sqlite was removed under the running service" in problem["detail"]

@@ -68,8 +68,7 @@ def running(settings: Settings, n_replicas=2, make_run_job=None, n_administrator
         with warnings.catch_warnings(action="ignore"):
             cluster()
             encoders = application.Encoders(1)
-            fleet = application.build(settings, n_replicas, make_run_job, encoders, n_administrators)
-            front = application.start(fleet, name)
+            front = application.start(settings, n_replicas, make_run_job, name, encoders, n_administrators)
             address = front.address.remote().result()
         yield Fleet(name, address)
     finally:

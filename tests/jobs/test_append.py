@@ -175,10 +175,7 @@ def test_a_map_knows_the_frames_it_is_made_of(first, run, catalog):
 def test_digests_stay_as_they_are():
     """They are compared with those in map files of other releases."""
     frames = np.array([[1.0, 2.0], [0.0, -1.5]], np.float32)
-    assert digests(frames) == [
-        7373934272132878346,
-        14435273145991011183,
-    ]
+    assert digests(frames) == [7373934272132878346, 14435273145991011183]
 
 
 def test_an_imported_map_is_appended_to_under_the_names_of_here(first, run, catalog, drive, tmp_path):

@@ -8,11 +8,7 @@ import pytest
 
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.errors import (
-    CancelledError,
-    InvalidEncodingError,
-    InvalidMapConfigError,
-)
+from deepsimbad.errors import CancelledError, InvalidEncodingError, InvalidMapConfigError
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, remap_stages, stages_in
@@ -86,13 +82,7 @@ def test_the_active_maps_landmarks_may_come_from_another_encoder(catalog, drive,
 
 @pytest.mark.parametrize(
     "relevance",
-    [
-        Relevance.STANDARDISED,
-        Relevance.RRF,
-        Relevance.BAG_OF_LANDMARKS,
-        Relevance.SIMBAD,
-        Relevance.BRUTE_FORCE,
-    ],
+    [Relevance.STANDARDISED, Relevance.RRF, Relevance.BAG_OF_LANDMARKS, Relevance.SIMBAD, Relevance.BRUTE_FORCE],
 )
 def test_a_map_keeps_what_its_relevance_needs_and_no_more(catalog, drive, evaluator, quiet, relevance):
     drive("other", 30, seed=1)

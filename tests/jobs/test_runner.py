@@ -6,11 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from deepsimbad.errors import (
-    IdempotencyKeyReusedError,
-    JobInterruptedError,
-    UnavailableError,
-)
+from deepsimbad.errors import IdempotencyKeyReusedError, JobInterruptedError, UnavailableError
 from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog

@@ -45,10 +45,10 @@ def wheel(tmp_path_factory):
 def bare(wheel, tmp_path_factory):
     """The folder of programs of a fresh environment that holds the bare wheel."""
     folder = tmp_path_factory.mktemp("bare") / "env"
-    venv.create(folder, with_pip=True)
+    venv.create(folder)
     run(
-        *(folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"),
-        *("--constraint", PROJECT / "constraints.txt", wheel),
+        *(sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install", "--no-compile", "--quiet"),
+        *("--disable-pip-version-check", "--constraint", PROJECT / "constraints.txt", wheel),
     )
     return folder / "bin"
 

@@ -14,13 +14,7 @@ import pytest
 
 from deepsimbad.core.index.packing import pack_lists
 from deepsimbad.core.map import Map
-from deepsimbad.errors import (
-    CancelledError,
-    ConflictError,
-    DamagedMapError,
-    InvalidInputError,
-    UnavailableError,
-)
+from deepsimbad.errors import CancelledError, ConflictError, DamagedMapError, InvalidInputError, UnavailableError
 from deepsimbad.store import arrays
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, table_bytes, verify, write_map

@@ -16,14 +16,7 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import DamagedFileError, InvalidInputError, UnavailableError, UnknownSessionError
 from deepsimbad.store.connection import MAX_BATCH
-from deepsimbad.store.sessions import (
-    IdempotencyKey,
-    ObservedRow,
-    PriorRow,
-    SessionRecord,
-    SessionStore,
-    StateSnapshot,
-)
+from deepsimbad.store.sessions import IdempotencyKey, ObservedRow, PriorRow, SessionRecord, SessionStore, StateSnapshot
 
 RECORD = SessionRecord(0, "s1", "campus", 3, "f" * 64, {"filter": "grid", "seed": 2**53}, 100.0, 200.0, 0, None)
 RANKS = np.array([1, 2.5, 2.5, 4], np.float32)

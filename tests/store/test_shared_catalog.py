@@ -256,10 +256,7 @@ def test_a_data_directory_with_domains_publishes_them_when_it_begins_to_follow(
 
 
 def test_a_new_node_begins_with_all_domains_in_one_object(
-    node: MakeNode,
-    add_map: Callable[..., MapRecord],
-    store: tuple[str, Path],
-    monkeypatch: pytest.MonkeyPatch,
+    node: MakeNode, add_map: Callable[..., MapRecord], store: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shared_catalog, "_LEAST_BETWEEN_STATES", 4)
     here = node("here")

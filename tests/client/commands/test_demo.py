@@ -12,11 +12,7 @@ OURS, RANDOM, CONSTANT = PLANNERS
     [
         ((1.0, 5.0, 2.0), ([-6, -2], [-2, 0.5]), f"that is more than chance over {RANDOM}."),
         ((3.0, 5.0, 2.0), ([-6, -2], [0.2, 2]), "The default did not win here, and that is more than chance."),
-        (
-            (3.0, 5.0, 2.0),
-            ([-6, -2], [-1, 2]),
-            "did not win here, which 10 starts cannot tell from chance.",
-        ),
+        ((3.0, 5.0, 2.0), ([-6, -2], [-1, 2]), "did not win here, which 10 starts cannot tell from chance."),
         ((None, None, None), (None, None), "No episode could be scored."),
     ],
 )

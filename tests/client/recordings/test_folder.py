@@ -66,8 +66,7 @@ def test_positions_are_read_in_every_documented_form(folder, lines):
 
 
 @pytest.mark.parametrize(
-    "lines",
-    [["x_m,y_m", "0,0", "3,4", "3,14", "3,15"], ["8.png,0,0", "9.png,3,4", "10.png,3,14", "11.png,3,15"]],
+    "lines", [["x_m,y_m", "0,0", "3,4", "3,14", "3,15"], ["8.png,0,0", "9.png,3,4", "10.png,3,14", "11.png,3,15"]]
 )
 def test_ground_coordinates_alone_give_the_distance_along_them(folder, lines):
     positions(folder, *lines)

@@ -122,10 +122,7 @@ def test_exif_places_the_images_that_have_it(tmp_path):
         return {1: "N", 2: degrees(along), 3: "W", 4: degrees(9), 29: "2011:05:10", 7: (12, 38, place)}
 
     recording = open_source(pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(30)], gps=gps))
-    assert recording.left_out_names == {
-        "without a position": ["20.jpg"],
-        "where no robot can have been": ["10.jpg"],
-    }
+    assert recording.left_out_names == {"without a position": ["20.jpg"], "where no robot can have been": ["10.jpg"]}
     assert recording.frames[-1].position_m == pytest.approx(58, abs=0.1)
     assert recording.frames[-1].timestamp_us == (1_305_031_080 + 29) * 1_000_000
 

@@ -60,12 +60,7 @@ def test_on_equal_steps_the_beliefs_are_those_of_plain_loops(closed, additive, s
         factors = seen[np.newaxis]
         truth = int(rng.integers(120))
         rank = step_beliefs(
-            lattice,
-            beliefs,
-            at_first_view(moves, action, step == 0),
-            factors,
-            np.array([truth]),
-            additive=additive,
+            lattice, beliefs, at_first_view(moves, action, step == 0), factors, np.array([truth]), additive=additive
         )
         mass = beliefs[0].astype(np.float64) / beliefs[0].sum(dtype=np.float64)
         assert np.abs(mass - slow).max() <= 2e-5 * slow.max()

@@ -5,14 +5,7 @@ import pytest
 
 from deepsimbad.core.belief.evidence import ViewEvidence
 from deepsimbad.core.belief.grid import GridFilter
-from deepsimbad.core.experience.nnql import (
-    KnownWalk,
-    NnqlConfig,
-    Transitions,
-    initial_q_values,
-    learn,
-    transitions_of,
-)
+from deepsimbad.core.experience.nnql import KnownWalk, NnqlConfig, Transitions, initial_q_values, learn, transitions_of
 from deepsimbad.core.experience.training import TrainingWorld, Walk
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.metrics import rank_of_truth
