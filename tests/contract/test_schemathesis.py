@@ -90,7 +90,8 @@ settings = Settings(data_dir=data_dir, port=int(sys.argv[-1]), event_poll_s=0.01
 if "TEST_FLEET" in os.environ:
     from tests.fleet.running import application, cluster
     cluster()
-    application.start(settings.model_copy(update={"map_store": f"file://{data_dir}-store"}), 2, InThisProcess)
+    settings = settings.model_copy(update={"map_store": f"file://{data_dir}-store"})
+    application.start(application.build(settings, 2, InThisProcess))
     application.wait()
 else:
     server.create_app = partial(server.create_app, run_job=InThisProcess(data_dir))

@@ -369,6 +369,7 @@ def test_a_restart_and_a_retired_map(tmp_path):
         path = client.session()
         assert client.delete("/v1/admin/domains/ready").status_code == 204
         problem(client.get(path), 410, "ended_session")
+        problem(client.get(f"{path}/events?after=0"), 410, "retired_map")  # which no stream can tell
 
 
 # Any action set

@@ -23,6 +23,12 @@ async def _session(session_id: SessionId, request: Request, running: Running) ->
     return await run_sync(running.session_events.find, session_id, robot_of(request))
 
 
+async def _followed(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> SessionRecord:
+    """The same, so that one whose map is no more is refused before a stream begins."""
+    await run_sync(running.sessions.engine_of, session)
+    return session
+
+
 def _observed(view: SessionView) -> SessionAnswer:
     return render_observation(view, Stopwatch())
 
@@ -41,7 +47,7 @@ def _observed(view: SessionView) -> SessionAnswer:
     },
 )
 async def get_session_events(
-    session: Annotated[SessionRecord, Depends(_session)],
+    session: Annotated[SessionRecord, Depends(_followed)],
     request: Request,
     running: Running,
     after: Annotated[

@@ -125,6 +125,7 @@ def serve(
     os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
     joined(address)
     of_networks = application.Encoders(encoders, encoder_gpus)
-    front = application.start(settings, replicas, encoders=of_networks, n_administrators=administrators)
+    fleet = application.build(settings, replicas, encoders=of_networks, n_administrators=administrators)
+    front = application.start(fleet)
     click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
     application.wait()

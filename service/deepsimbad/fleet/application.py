@@ -77,17 +77,9 @@ def build(
     return serve.deployment(**_EACH)(Front).options(name="front").bind(settings, [admin, *others], replicas)
 
 
-def start(
-    settings: Settings,
-    n_replicas: int,
-    make_run_job: MakeRunJob | None = None,
-    name: str = NAME,
-    encoders: Encoders = Encoders(),
-    n_administrators: int = 1,
-) -> DeploymentHandle[Front]:
-    """Start the fleet in the cluster that this process has joined; returns when it answers."""
+def start(fleet: serve.Application, name: str = NAME) -> DeploymentHandle[Front]:
+    """Start what `build` gives in the cluster that this process has joined; returns when it answers."""
     serve.start(proxy_location="Disabled")  # the front listens itself
-    fleet = build(settings, n_replicas, make_run_job, encoders, n_administrators)
     return serve.run(fleet, name=name, route_prefix=None)
 
 

@@ -73,6 +73,18 @@ def test_a_view_that_excludes_all_that_is_believed_changes_nothing(route):
     np.testing.assert_allclose(belief.updated(seen(relevance, UpdateRule.LOG_LIKELIHOOD), step=0).mass, belief.mass)
 
 
+@pytest.mark.parametrize("kind", list(FilterKind))
+def test_a_belief_at_a_wrong_place_goes_on_however_surely_views_exclude_it(kind, route):
+    """Without what is found on the way, more and more of it is lost, and none but for rounding is on the route."""
+    belief = FILTERS[kind].around(route, 20.0, 2.0, rule=UpdateRule.LOG_LIKELIHOOD)
+    relevance = np.where(np.arange(100) < 80, 0.0, 500.0)
+    for step in range(5):
+        belief = belief.updated(seen(relevance, UpdateRule.LOG_LIKELIHOOD), step)
+        belief = belief.predicted(1.0, 0.1, step + 1)
+        assert belief.mass.sum() == pytest.approx(1)
+    assert belief.off_route == pytest.approx(1)
+
+
 def error_matrix(n, action, std, closed=False, slipping=1.0):
     """[n, n] where the mass of a cell comes to lie, of which none is lost at the ends; all in cells.
 
@@ -232,6 +244,13 @@ def test_what_leads_past_the_end_is_lost(route):
     assert doubted.off_route > 0.8, "a robot that may be lost is refused no move"
 
 
+@pytest.mark.parametrize("std", [1.0, 5.0])
+def test_of_a_move_that_errs_past_both_ends_of_a_short_route_nothing_is_lost(std):
+    before = holding(Route(np.arange(4.0)), [1, 0, 2, 1], rule=UpdateRule.ADDITIVE_RELEVANCE)
+    after = before.predicted(0.0, std, step=1)
+    assert after.masses.sum() == pytest.approx(1)
+
+
 def test_images_of_one_stop_share_what_arrives_there():
     route = Route(np.array([0.0, 1.0, 2.0, 2.0, 2.0, 3.0]))
     moved = holding(route, [0, 1.0, 0, 0]).predicted(1.0, 0.0, step=1)
@@ -313,6 +332,13 @@ def test_a_robot_that_has_moved_may_always_have_been_carried(kind, route):
 
 
 # --- lost ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_move_found_is_there_until_a_view_says_where(route):
+    belief = ParticleFilter.uniform(route).predicted(1000.0, 0.0, step=2)  # past the end, wherever it was
+    for action_m in (0.0, 1.0):
+        belief = belief.predicted(action_m, 0.1, step=3)  # the view between told nothing
+        np.testing.assert_allclose(belief.mass, 0.01)
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))

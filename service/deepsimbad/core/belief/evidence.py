@@ -29,6 +29,9 @@ PRIOR_TRUST = (0.2, 0.4, 0.4)
 
 TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
 
+LEAST_ALLOWED = 1e-12
+"""How likely a view is at places that it excludes, against the map on the whole: a belief always holds some."""
+
 LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief.cells import SUMS
 from deepsimbad.core.belief.evidence import (
+    LEAST_ALLOWED,
     LOST_AT_FIX,
     LOST_AT_START,
     Doubt,
@@ -108,11 +109,10 @@ class GridFilter:
         """
         cells, doubt, reach_m = self.route.cells, self.doubt, SIGMAS * action_std_m
         shift, offset_m = cells.shifted(self.offset_m + action_m)
-        on_route = 1 - doubt.lost
         for beyond_m in (reach_m if doubt.is_mixture or action_m == 0 else 0.0, reach_m):
             some = cells.sources(shift, offset_m, beyond_m)
-            without = self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
-            surviving = on_route - without
+            surviving = self.masses[:, some].sum(axis=1)
+            on_route = surviving + self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
             if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or self.masses[:, some].any():
                 break  # else it may still have stopped at the end
         check_ahead(self.route, doubt, on_route, surviving, action_m)
@@ -165,21 +165,24 @@ def _see(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
     """Multiply by likelihoods [c] of the least trust, normalise, and weigh the trusts.
 
-    Where a view allows nothing that a trust still believes, that trust keeps what it knew.
+    Where a view allows nothing that a trust still believes, that trust keeps what it knew of places: there is always
+    something to go on from, however surely the robot is lost.
 
     Returns:
         Masses [t, c], lost [t], log trusts [t], and the share of what is believed that moved.
     """
     average, total = _likelihoods(masses, likelihood)
-    gain, lost_after, log_trust_after = np.zeros(lost.size), lost.copy(), log_trust.copy()
+    gain, kept, lost_after, log_trust_after = np.zeros(lost.size), np.zeros(lost.size), lost.copy(), log_trust.copy()
     for t in range(lost.size):
-        total[t] += lost[t] * average[t]
-        if total[t] > _NOTHING:
-            gain[t] = 1.0 / total[t]
-            lost_after[t] = lost[t] * average[t] * gain[t]
-            log_trust_after[t] += np.log(total[t] / average[t])
+        if total[t] <= _NOTHING:
+            total[t] = LEAST_ALLOWED * average[t]
+            kept[t] = total[t] / max(masses[t].sum(), _NOTHING)
+        whole = total[t] + lost[t] * average[t]
+        gain[t] = 1.0 / whole
+        lost_after[t] = lost[t] * average[t] * gain[t]
+        log_trust_after[t] += np.log(whole / average[t])
     weights = _trusted(log_trust, lost), _trusted(log_trust_after, lost_after)
-    after, moved = _multiplied(masses, likelihood, gain, weights[0], weights[1])
+    after, moved = _multiplied(masses, likelihood, kept, gain, weights[0], weights[1])
     return after, lost_after, log_trust_after, 0.5 * moved
 
 
@@ -220,6 +223,7 @@ def _likelihoods(
 def _multiplied(
     masses: NDArray[np.float64],
     likelihood: NDArray[np.float64],
+    kept: NDArray[np.float64],
     gain: NDArray[np.float64],
     weight: NDArray[np.float64],
     weight_after: NDArray[np.float64],
@@ -227,7 +231,7 @@ def _multiplied(
     """Masses [t, c] times likelihoods and gains [t], and the sum of differences of what is believed.
 
     Args:
-        gain: 0 where a trust stays as it was.
+        kept: [t] in place of likelihoods, where that is not 0.
         weight, weight_after: [t] by which masses before and after are believed.
     """
     n_trusts, n = masses.shape
@@ -237,7 +241,7 @@ def _multiplied(
         change = np.zeros(powers.size)
         for t in range(n_trusts):
             before, row = masses[t, begin : begin + _BLOCK], after[t, begin : begin + _BLOCK]
-            times, plus = gain[t], 1.0 if gain[t] == 0 else 0.0
+            times, plus = 0.0 if kept[t] > 0 else gain[t], kept[t] * gain[t]
             share, share_after = weight[t], weight_after[t]
             for i in range(powers.size):
                 row[i] = before[i] * (powers[i] * times + plus)
@@ -289,10 +293,10 @@ def _moved(
                 on_route[0] += masses[t, i]
             for i in range(max(most, first), stop):
                 on_route[n - 1] += masses[t, i]
-            for i in range(min(width, n)):  # of what is near an end, the part that stays on the route is all
-                on_route[i] /= 1.0 - taps[: width - i].sum()
-            for i in range(min(width, n)):
-                on_route[n - 1 - i] /= 1.0 - taps[width + i + 1 :].sum()
+            near = min(width, n)
+            for end in range(near + min(width, n - near)):  # of what is near an end, what stays on the route is all
+                i = end if end < near else n - 1 - (end - near)
+                on_route[i] /= taps[max(width - i, 0) : width + n - i].sum()
         for begin in range(0, n, _BLOCK):
             row = moved[t, begin : begin + _BLOCK]
             middle = source[begin + width : n + 2 * width]

@@ -9,7 +9,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief.evidence import LOST_AT_FIX, LOST_AT_START, Doubt, ViewEvidence, added, moved_along
+from deepsimbad.core.belief.evidence import (
+    LEAST_ALLOWED,
+    LOST_AT_FIX,
+    LOST_AT_START,
+    Doubt,
+    ViewEvidence,
+    added,
+    moved_along,
+)
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.motion import SIGMAS, check_ahead, leaving_and_found, move_stds_m
 from deepsimbad.core.relevance import UpdateRule
@@ -112,12 +120,11 @@ class ParticleFilter:
             if not weights.any():  # it may still have stopped at the end
                 weights = np.where(past_m > reach_m, 0.0, before.weights)
             target_m = np.clip(target_m, route.start_m, route.position_m[-1])
-        on_route, surviving = before.weights.sum(axis=1), weights.sum(axis=1)
+        on_route, surviving = before.weights.sum(axis=1) + self.found, weights.sum(axis=1) + self.found
         if step == 1 or not self.doubt.is_mixture:  # later it may have been carried, if no particle is where that is
             check_ahead(route, self.doubt, on_route, surviving, action_m)
-        lost, staying, found = leaving_and_found(
-            self.doubt, self.doubt.lost + self.found, on_route, surviving, action_m
-        )
+        lost, staying, found = leaving_and_found(self.doubt, self.doubt.lost, on_route, surviving, action_m)
+        found = found + staying * self.found  # before a view that told nothing
         stds_m = move_stds_m(action_m, action_std_m, self.doubt)
         std_m = rng.choice(list(stds_m.values()), target_m.size, p=list(stds_m))
         moved = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
@@ -146,9 +153,11 @@ class ParticleFilter:
                 self.found * average,
                 self.doubt.lost * average,
             )
+            if (is_excluded := weights.sum(axis=1) + found <= _NOTHING).any():  # what was known of places stays
+                kept = LEAST_ALLOWED * average / np.maximum(self.weights.sum(axis=1) + self.found, _NOTHING)
+                weights = np.where(is_excluded[:, np.newaxis], self.weights * kept[:, np.newaxis], weights)
+                found = np.where(is_excluded, self.found * kept, found)
             total = weights.sum(axis=1) + found + lost
-            if (total <= 0).any():  # the view allows nothing that is still believed: what was known stays
-                return replace(self, told=0.0)
             doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), values)
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
             after = weighed._placed(way, step) if doubt.is_mixture else weighed._evened_out(step)

@@ -106,9 +106,10 @@ def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
     lock, listed = Lock.read(folder), known(wish.extractor)
     old = lock.hub_record(wish.extractor)
     repository = (listed.extractor if listed else wish.extractor).removeprefix(HUB).partition(":")[0]
-    arguments = {**(old.arguments if old else listed.arguments if listed else {}), **wish.arguments}
-    size = wish.input_size or (old.input_size if old else listed.input_size if listed else None) or HUB_INPUT_SIZE
-    commit = wish.commit or (old.commit if old else listed.commit if listed else None)
+    told = old or listed
+    arguments = {**(told.arguments if told else {}), **wish.arguments}
+    size = wish.input_size or (told.input_size if told else None) or HUB_INPUT_SIZE
+    commit = wish.commit or (told.commit if told else None)
     if commit is None:
         commit = resolve_commit(repository, f"say which one you want with --commit; see {archive_url(repository, '')}")
     hub = folder.absolute() / HUB_FOLDER
