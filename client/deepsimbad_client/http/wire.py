@@ -292,13 +292,14 @@ class Wire:
                 return tuple(entries)
 
     async def events(self, call: Call) -> AsyncGenerator[httpx2.ServerSentEvent, None]:
-        """Yield the events of a stream, listened to once; raises TransportError, ApiError."""
+        """Yield the events of a stream, listened to once and left at the last; raises TransportError, ApiError."""
         what = f"{call} at {self.url}"
         try:
             async with self.link.stream(self.request(call)) as response:
                 raise_for_problem(response)
                 async for event in self.link.events(response):
                     yield event
+                raise TransportError(f"{what} ended before all was told: the service stops, or the key was revoked")
         except httpx2.TimeoutException as error:
             raise TransportTimeoutError(f"{what} fell silent: {error or type(error).__name__}") from error
         except httpx2.TransportError as error:

@@ -172,6 +172,16 @@ def test_lists_and_events_in_both_clients():
     run_async(shelf, read)
 
 
+def test_a_stream_that_ends_before_its_last_event_broke_off():
+    """As the service ends all when it stops: the session, or the job, goes on."""
+    stream = f"event: progress\ndata: {json.dumps(JOB)}\n\n"
+    script = Script(httpx2.Response(200, content=stream.encode(), headers={"content-type": "text/event-stream"}))
+    events = script.client().admin.job_events("j")
+    assert next(events).state == "running"
+    with pytest.raises(errors.TransportError, match="ended before"):
+        next(events)
+
+
 def test_a_stream_that_is_left_early_is_closed():
     class Stream(httpx2.SyncByteStream):
         closed = False
