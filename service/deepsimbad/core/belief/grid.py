@@ -33,6 +33,7 @@ from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 
 _BLOCK = 1024  # cells whose sums stay in the first-level cache
+_ROUNDED = 1e-6  # of what differences of masses that sum to 1 leave, rounding may be too much
 _NOTHING = 1e-300  # what a view leaves of a belief that it does not allow, or less
 
 
@@ -111,8 +112,11 @@ class GridFilter:
         shift, offset_m = cells.shifted(self.offset_m + action_m)
         for beyond_m in (reach_m if doubt.is_mixture or action_m == 0 else 0.0, reach_m):
             some = cells.sources(shift, offset_m, beyond_m)
-            surviving = self.masses[:, some].sum(axis=1)
-            on_route = surviving + self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
+            leaving = self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
+            surviving = 1 - doubt.lost - leaving
+            if surviving.min() < _ROUNDED:
+                surviving = self.masses[:, some].sum(axis=1)
+            on_route = surviving + leaving
             if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or self.masses[:, some].any():
                 break  # else it may still have stopped at the end
         check_ahead(self.route, doubt, on_route, surviving, action_m)
