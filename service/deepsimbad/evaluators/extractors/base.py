@@ -11,6 +11,9 @@ from deepsimbad.evaluators.base import Image
 from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.runtimes import Run
 
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of red, green and blue from 0 to 1, by which most pretrained networks want their images."""
+
 _LONGEST_SIDE = 1024  # pixels, where images keep their aspect; larger ones are reduced
 
 
@@ -87,3 +90,9 @@ class NetworkExtractor:
         shrink = min(1.0, _LONGEST_SIDE / max(width, height))
         wide, high = (max(self.shortest_side, round(side * shrink)) for side in (width, height))
         return resized(image, (wide, high))
+
+
+def in_pixels(shares: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Of three channels from 0 to 1, as pixels from 0 to 255 have it."""
+    red, green, blue = shares
+    return red * 255, green * 255, blue * 255

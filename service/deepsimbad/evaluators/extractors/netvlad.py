@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from deepsimbad.errors import InvalidWeightsError
 from deepsimbad.evaluators.compute import Compute
-from deepsimbad.evaluators.extractors.base import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import IMAGENET_MEAN, IMAGENET_STD, NetworkExtractor, in_pixels
 from deepsimbad.evaluators.runtimes import make_run
 from deepsimbad.evaluators.weights.files import MATLAB_MAGIC, encodings_sha256, fill, load_checkpoint, read_variable
 from deepsimbad.evaluators.weights.lock import Lock
@@ -32,8 +32,7 @@ _SHORTEST_SIDE = 16  # pixels: of fewer, nothing is left behind four maxima
 _LAYERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # of the convolutions, ReLUs and maxima counted too
 STAGES = (2, 2, 3, 3, 3)  # convolutions of each stage; a maximum of 2 x 2 lies between two stages
 N_CONVOLUTIONS = sum(STAGES)
-_IMAGENET_MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
-_IMAGENET_DEVIATION = (0.229 * 255, 0.224 * 255, 0.225 * 255)
+_IMAGENET = in_pixels(IMAGENET_MEAN), in_pixels(IMAGENET_STD)
 
 
 def netvlad(file: str, compute: Compute) -> NetworkExtractor:
@@ -68,9 +67,9 @@ class _Names:
 
 
 MATLAB = Preset("matlab", cluster_major=False, mean=None, deviation=(1.0, 1.0, 1.0), input_size=None)
-PATCH_NETVLAD = Preset("patch_netvlad", True, _IMAGENET_MEAN, _IMAGENET_DEVIATION, (640, 480))
+PATCH_NETVLAD = Preset("patch_netvlad", True, *_IMAGENET, (640, 480))
 # Trained and tested on Pittsburgh's images of 640 x 480 as they are.
-PYTORCH_NETVLAD = Preset("pytorch_netvlad", True, _IMAGENET_MEAN, _IMAGENET_DEVIATION, (640, 480))
+PYTORCH_NETVLAD = Preset("pytorch_netvlad", True, *_IMAGENET, (640, 480))
 # Its weights begin from the MATLAB network's, and so do its pixels: MatConvNet's mean, and no division.
 OPENIBL = Preset("openibl", True, (123.68, 116.779, 103.939), (1.0, 1.0, 1.0), (640, 480))
 

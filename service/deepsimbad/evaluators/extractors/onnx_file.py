@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError, OutOfMemoryError
 from deepsimbad.evaluators.base import is_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, available_cores
-from deepsimbad.evaluators.extractors.base import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import IMAGENET_MEAN, IMAGENET_STD, NetworkExtractor
 from deepsimbad.evaluators.runtimes import INSTALL_FAST, has_onnxruntime, onnx_session
 from deepsimbad.evaluators.weights.files import encodings_sha256
 from deepsimbad.evaluators.weights.lock import Lock
@@ -29,8 +29,8 @@ _LARGEST = 1e6  # number that images are normalised by
 _MOST_BYTES = (2 << 30) - 1  # of a protocol buffer
 _PREFIX = "deepsimbad."
 _DEFAULTS: Mapping[str, Any] = {
-    "mean": [0.485, 0.456, 0.406],  # ImageNet's, of R, G and B
-    "std": [0.229, 0.224, 0.225],
+    "mean": IMAGENET_MEAN,
+    "std": IMAGENET_STD,
     "scale": 1 / 255,
     "channels": "RGB",
     "layout": "NCHW",

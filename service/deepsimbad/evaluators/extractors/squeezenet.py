@@ -19,7 +19,7 @@ import numpy as np
 
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError
 from deepsimbad.evaluators.compute import Compute
-from deepsimbad.evaluators.extractors.base import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import IMAGENET_MEAN, IMAGENET_STD, NetworkExtractor, in_pixels
 from deepsimbad.evaluators.runtimes import INSTALL_TORCH, has_torch, make_run
 from deepsimbad.evaluators.weights.files import check_size, encodings_sha256, fill, load_checkpoint
 from deepsimbad.evaluators.weights.lock import Lock
@@ -71,10 +71,7 @@ class Preset:
 
 
 CAFFE = Preset("caffe", is_rgb=False, mean=(104.0, 117.0, 123.0), std=(1.0, 1.0, 1.0), side=227)
-TORCHVISION = Preset(
-    "torchvision", is_rgb=True, mean=(0.485 * 255, 0.456 * 255, 0.406 * 255),
-    std=(0.229 * 255, 0.224 * 255, 0.225 * 255), side=224,
-)  # fmt: skip
+TORCHVISION = Preset("torchvision", is_rgb=True, mean=in_pixels(IMAGENET_MEAN), std=in_pixels(IMAGENET_STD), side=224)
 
 
 @dataclass(frozen=True)

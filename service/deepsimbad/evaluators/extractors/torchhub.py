@@ -31,14 +31,13 @@ from deepsimbad.errors import (
 )
 from deepsimbad.evaluators.base import is_lack_of_memory
 from deepsimbad.evaluators.compute import Compute, Runtime
-from deepsimbad.evaluators.extractors.base import NetworkExtractor
+from deepsimbad.evaluators.extractors.base import IMAGENET_MEAN, IMAGENET_STD, NetworkExtractor
 from deepsimbad.evaluators.runtimes import make_run
 from deepsimbad.evaluators.weights.downloads import check_digest
 from deepsimbad.evaluators.weights.files import encodings_sha256, file_sha256
 from deepsimbad.evaluators.weights.library import HUB, Argument
 from deepsimbad.evaluators.weights.lock import CHECKPOINTS, HUB_FOLDER, HubRecord, Lock
 
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, RGB
 _RECIPE = 1  # see `encodings_sha256`
 _NETWORK_EVENTS = {"urllib.Request", "socket.getaddrinfo", "socket.gethostbyname"}
 # A nested `torch.hub.load` asks this first, and is content with what is here where nobody answers.
@@ -83,8 +82,8 @@ class HubModule(nn.Module):
         super().__init__()
         self.trunk = trunk
         self._extractor, self._encoding_dim = extractor, encoding_dim
-        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
-        self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
         """See the class; raises InvalidWeightsError."""
