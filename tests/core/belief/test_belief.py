@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepsimbad.core.belief.cells import Cells
 from deepsimbad.core.belief.evidence import ViewEvidence
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.motion import motion_std_m
@@ -426,6 +427,18 @@ def test_a_view_is_heard_of_between_images_as_the_way_leads_to_the_other(kind):
         mass = np.array([likelihood[:256].sum() / 2] * 2 + [likelihood[256:].sum() + 256, 256])
         expected = expected + probable * mass / mass.sum()
     np.testing.assert_allclose(belief.mass, expected, atol=0.005)
+
+
+@pytest.mark.parametrize("offset_m", [-0.5, -0.3, -0.1, 0.0, 0.4])
+@pytest.mark.parametrize("gap_m", [0.05, 2.0])
+def test_cells_of_a_loop_hear_of_a_view_between_the_places_beside_them(gap_m, offset_m):
+    """However near the loop's last place is to its first."""
+    place_m = np.array([3.0, 4.0, 6.0, 8.0, 10.0])
+    values, length_m = np.array([5.0, 1.0, -2.0, 0.0, 7.0]), 7.0 + gap_m
+    cells = Cells.along(place_m, length_m, closed=True)
+    at_m = cells.position_m + offset_m * cells.step_m
+    expected = np.interp(at_m, place_m, values, period=length_m)
+    np.testing.assert_allclose(cells.of_places(values, offset_m * cells.step_m), expected, atol=1e-9)
 
 
 def test_the_same_seed_and_steps_give_the_same_bits():

@@ -93,13 +93,16 @@ def _interpolated(
         metres = from_m + cell * step_m
         while after <= last and at_m[after] < metres:
             after += 1
-        if 0 < after <= last:
-            share = (metres - at_m[after - 1]) / (at_m[after] - at_m[after - 1])
-            into[cell] = values[after - 1] + (values[after] - values[after - 1]) * share
+        upper = after
+        if after == 0 and length_m > 0:  # a turn later, which may be before the last place
+            metres += length_m
+            upper = np.searchsorted(at_m, metres)
+        if 0 < upper <= last:
+            share = (metres - at_m[upper - 1]) / (at_m[upper] - at_m[upper - 1])
+            into[cell] = values[upper - 1] + (values[upper] - values[upper - 1]) * share
         elif length_m > 0:  # between the last place and the first
             gap_m = at_m[0] + length_m - at_m[last]
-            beyond_m = metres - at_m[last] if after > last else metres + length_m - at_m[last]
-            into[cell] = values[last] + (values[0] - values[last]) * (beyond_m / gap_m if gap_m > 0 else 0.0)
+            into[cell] = values[last] + (values[0] - values[last]) * ((metres - at_m[last]) / gap_m)
         else:
             into[cell] = values[min(after, last)]
     return into
