@@ -96,7 +96,7 @@ def _interpolated(
         upper = after
         if after == 0 and length_m > 0:  # a turn later, which may be before the last place
             metres += length_m
-            upper = np.searchsorted(at_m, metres)
+            upper = int(np.searchsorted(at_m, metres))
         if 0 < upper <= last:
             share = (metres - at_m[upper - 1]) / (at_m[upper] - at_m[upper - 1])
             into[cell] = values[upper - 1] + (values[upper] - values[upper - 1]) * share
