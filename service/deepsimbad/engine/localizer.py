@@ -179,7 +179,7 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
             raise InvalidDissimilaritiesError(
                 f"{view.values.size} dissimilarities; this map has {n_landmarks} landmarks", n_landmarks=n_landmarks
             )
-        if np.ptp(view.values) == 0:
+        if view.values.min() == view.values.max():  # whose difference may be beyond float64
             return Query.uninformative(n_landmarks)
         # Ranks are drawn from the full numbers; those that are compared by squares must stay finite.
         within = np.clip(view.values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY).astype(np.float32)
