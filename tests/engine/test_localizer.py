@@ -43,7 +43,8 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
 
 
 def test_huge_dissimilarities_are_ranked_all_the_same() -> None:
-    query = describe(map_contents(relevance=Relevance.SIMBAD), EVALUATOR, Dissimilarities(1.7e308 * np.linspace(1, -1, 9)))
+    view = Dissimilarities(1.7e308 * np.linspace(1, -1, 9))
+    query = describe(map_contents(relevance=Relevance.SIMBAD), EVALUATOR, view)
     assert query.ranks.tolist() == list(range(9, 0, -1))
 
 
