@@ -1,5 +1,7 @@
 """A disk that may not be written: who asks is answered, who would write is told, and nothing is tried twice."""
 
+import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -8,10 +10,11 @@ from pathlib import Path
 import pytest
 
 from ..commands import Ran
+from ..killing import PROJECT
 from .conftest import command
 
 pytestmark = pytest.mark.slow
-# Root may write everywhere, unless it gives that right up before it becomes the command.
+# Root may write everywhere, unless it gives that right up before it becomes another program.
 UNPRIVILEGED = """
 import ctypes, os, sys
 DROP, DAC_OVERRIDE, DAC_READ_SEARCH, FOWNER = 24, 1, 2, 3
@@ -20,23 +23,26 @@ if os.geteuid() == 0:
         assert ctypes.CDLL(None).prctl(DROP, capability, 0, 0, 0) == 0
 os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
 """
+COMMANDS = """
+import dataclasses, json, sys
+from tests.commands import ran
+print(json.dumps([dataclasses.astuple(ran(["deepsimbad", *words])) for words in json.loads(sys.argv[1])]))
+"""
 
 
-def unprivileged(*arguments: object) -> Ran:
-    """Run `deepsimbad` as somebody who may not write everywhere."""
-    done = subprocess.run(
-        [sys.executable, "-c", UNPRIVILEGED, "-m", "deepsimbad", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-    return Ran(done.returncode, done.stdout, done.stderr)
+def unprivileged(*commands: tuple[object, ...]) -> list[Ran]:
+    """Run commands of `deepsimbad`, one after the other, as somebody who may not write everywhere."""
+    words = json.dumps([[str(word) for word in command] for command in commands])
+    program = [sys.executable, "-c", UNPRIVILEGED, "-c", COMMANDS, words]
+    done = subprocess.run(program, cwd=PROJECT, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return [Ran(*told) for told in json.loads(done.stdout)]
 
 
-@pytest.fixture
-def read_only(data_dir: Path) -> Iterator[Path]:
+@pytest.fixture(scope="module")
+def read_only(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A data directory that nobody may write."""
+    data_dir = Path(shutil.copytree(furnished, tmp_path_factory.mktemp("read_only") / "data"))
     everything = (data_dir, *data_dir.rglob("*"))
     for path in everything:
         path.chmod(0o555 if path.is_dir() else 0o444)
@@ -49,43 +55,28 @@ def read_only(data_dir: Path) -> Iterator[Path]:
 
 
 def test_the_service_does_not_start(read_only: Path) -> None:
-    ran = unprivileged("serve", "--port", 0, "--data-dir", read_only)
-    assert (ran.code, ran.out) == (1, "")
-    assert ran.err.splitlines()[-1] == f"deepsimbad: unavailable: {read_only.name}: it may not be written"
+    new = ("--create", "--data-dir", read_only / "new")
+    there, made = unprivileged(*(("serve", "--port", 0, *more) for more in (("--data-dir", read_only), new)))
+    assert (there.code, there.out, made.code, made.out) == (1, "", 1, "")
+    assert there.err.splitlines()[-1] == f"deepsimbad: unavailable: {read_only.name}: it may not be written"
+    assert made.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
 
 
-def test_a_data_directory_that_cannot_be_made_is_named(read_only: Path) -> None:
-    ran = unprivileged("serve", "--create", "--port", 0, "--data-dir", read_only / "new")
-    assert ran.code == 1
-    assert ran.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
-
-
-@pytest.mark.parametrize("arguments", [("delete-domain", "loop", "--yes"), ("keys", "create", "--scope", "admin")])
-def test_who_would_write_is_told_in_one_line(read_only: Path, arguments: tuple[str, ...]) -> None:
-    ran = unprivileged(*arguments, "--data-dir", read_only)
-    assert "may not be written" in ran.line or "cannot be opened" in ran.line
-
-
-def test_who_asks_is_answered(read_only: Path) -> None:
-    assert unprivileged("info", "loop", "--data-dir", read_only).code == 0
-
-
-def test_it_can_be_checked_and_backed_up(read_only: Path, tmp_path: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in read_only.rglob("*")}
-    ran = unprivileged("check", "--data-dir", read_only)
-    assert (ran.code, ran.out) == (0, ""), ran
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    ran = unprivileged("backup", elsewhere / "b.tar", "--data-dir", read_only)
-    assert (ran.code, ran.out) == (0, ""), ran
-    assert {path: path.stat().st_mtime_ns for path in read_only.rglob("*")} == before
-    assert command("restore", elsewhere / "b.tar", "--data-dir", elsewhere / "there").code == 0
-    assert command("check", "--data-dir", elsewhere / "there").code == 0
-
-
-def test_a_backup_to_where_nothing_may_be_written_is_one_line(read_only: Path) -> None:
-    for arguments in (("backup", read_only / "b.tar"), ("export", "loop", read_only / "m.map")):
-        ran = unprivileged(*arguments, "--data-dir", read_only)
+def test_who_would_write_is_told_in_one_line(read_only: Path) -> None:
+    """Into it, or into a backup or export beside what it holds."""
+    into = (("delete-domain", "loop", "--yes"), ("keys", "create", "--scope", "admin"))
+    beside = (("backup", read_only / "b.tar"), ("export", "loop", read_only / "m.map"))
+    for ran in unprivileged(*((*words, "--data-dir", read_only) for words in into + beside)):
         assert "may not be written" in ran.line or "cannot be opened" in ran.line
-    assert not list(read_only.glob("*b.tar*"))
-    assert not list(read_only.glob("*m.map*"))
+    assert not [*read_only.glob("*b.tar*"), *read_only.glob("*m.map*")]
+
+
+def test_who_asks_is_answered_and_it_can_be_checked_and_backed_up(read_only: Path, tmp_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in read_only.rglob("*")}
+    asked = (("info", "loop"), ("check",), ("backup", tmp_path / "b.tar"))
+    info, *others = unprivileged(*((*words, "--data-dir", read_only) for words in asked))
+    assert info.code == 0
+    assert [(ran.code, ran.out) for ran in others] == [(0, "")] * 2, others
+    assert {path: path.stat().st_mtime_ns for path in read_only.rglob("*")} == before
+    assert command("restore", tmp_path / "b.tar", "--data-dir", tmp_path / "there").code == 0
+    assert command("check", "--data-dir", tmp_path / "there").code == 0

@@ -9,7 +9,9 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from sqlite_utils import Database, Migrations
+from sqlite_utils.cli import cli
 
 import deepsimbad_migrations
 from deepsimbad.store.catalog import Catalog
@@ -47,13 +49,11 @@ def apply(path: Path, migrations: Migrations, **options: str) -> None:
         migrations.apply(db, **options)
 
 
-def run_command(path: Path, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "sqlite_utils", "migrate", str(path), str(folder), *options],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+def run_command(path: Path, folder: Path, *options: str) -> str:
+    """What it prints."""
+    ended = CliRunner().invoke(cli, ["migrate", str(path), str(folder), *options])
+    assert ended.exit_code == 0, ended.output
+    return ended.output
 
 
 @pytest.fixture(params=SETS)
@@ -77,7 +77,7 @@ def test_the_command_reaches_the_schema_that_the_service_makes(kind: str, tmp_pa
     before = rows_of(theirs)
     run_command(theirs, MIGRATIONS / kind)  # again changes nothing
     assert rows_of(theirs) == before
-    listing = run_command(theirs, MIGRATIONS / kind, "--list").stdout
+    listing = run_command(theirs, MIGRATIONS / kind, "--list")
     assert SETS[kind].name in listing
     assert "m001" in listing.split("Pending")[0]
 
