@@ -9,7 +9,6 @@ from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.recordings.track import arc_length_m
 
 START = 1_305_031_103  # 2011-05-10T12:38:23Z
-DEGREE_M = 111_320  # of latitude, roughly; of longitude at the equator
 
 
 def test_degrees_become_utm_metres_and_the_unknown_stays_unknown():
