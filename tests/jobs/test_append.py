@@ -275,6 +275,20 @@ def test_places_seen_again_become_the_mean_of_their_seasons(season, run, catalog
     assert found[1] > found[3] - 10
 
 
+def test_a_season_that_a_map_knows_is_not_fused_into_it_again(season, run, catalog):
+    """Views of it agree with the map far better than those of a season to come, and would be trusted as far."""
+    season("summer", 1)
+    season("winter", 2)
+    run("summer", landmark_traverse="winter", n_landmarks=60, training_episodes=0, same_route=True)
+    with Traverse.create(catalog.data_dir, DOMAIN, "copy") as traverse:
+        traverse.put_frames(Drive(position_m=np.arange(PLACES) + 0.25, encodings=stored(catalog, "winter").encodings))
+    for name in ("winter", "copy"):
+        with pytest.raises(InvalidMapConfigError, match=f"traverse {name} already"):
+            run(name, append=True)
+    season("spring", 3)
+    assert run("spring", append=True)["metrics"]["fused"]["accepted"]
+
+
 def test_a_drive_is_fused_only_where_its_views_agree(season, run, catalog):
     season("summer", 1)
     season("later", 2)

@@ -194,8 +194,7 @@ async def post_remap(
             what = "to append to: make one first, without append"
             raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)
         if config.append and record.active_version is not None:
-            active = running.catalog.map(domain, record.active_version)
-            refuse_known_traverse(active.config, active.version, config.training_traverse)
+            refuse_known_traverse(running.catalog.map(domain, record.active_version), config.training_traverse)
         with suppress(NoActiveMapError, UnavailableError):  # a damaged one keeps nobody from making another
             snapshot = None if record.active_version is None else running.maps.active(domain).snapshot
             refuse_impossible(config, n_frames, snapshot)

@@ -33,19 +33,23 @@ from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, NoActiveMapError, WeightsDifferError
 from deepsimbad.jobs.check import traverses_in
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.records import DomainRecord
+from deepsimbad.store.records import DomainRecord, MapRecord
 from deepsimbad.store.traverses import Traverse
 
 LANDMARK_TRAVERSE, ACTIVE_MAP, TRAINING = "landmark_traverse", "active_map", "training_traverse"
 """Where a map's landmarks come from, as its `metrics.landmarks` says."""
 
 
-def refuse_known_traverse(config: Mapping[str, Any], version: int, name: str) -> None:
+def refuse_known_traverse(active: MapRecord, name: str) -> None:
     """Refuse to append a traverse that a map holds by name, though it may hold other frames by now.
+
+    What is fused into places is held as images are: counted twice it would be taken for a season that is no other,
+    and views trusted many times too far.
 
     Raises InvalidMapConfigError: the map is made of a traverse of that name.
     """
-    if name in traverses_in(config):
+    version, is_fused = active.version, active.config.get("relevance") == Relevance.COMPOSED
+    if name in traverses_in(active.config) or (is_fused and name in seasons_in(active.config, active.metrics)):
         raise InvalidMapConfigError(
             f"map {version}, which serves, holds traverse {name} already: nothing is appended twice. Append another "
             "drive (a new one needs a name of its own), or activate a map without this one first",

@@ -344,8 +344,11 @@ class _Remap:
         config, drive = self.config, inputs.training
         record = self.catalog.map(self.domain, inputs.domain.active_version or 0)
         self.progress.stage("describe")
-        refuse_known_traverse(record.config, record.version, config.training_traverse)
-        if before.frame_digest is not None and np.isin(drive.digests(), before.frame_digest).all():
+        refuse_known_traverse(record, config.training_traverse)
+        held = [] if before.frame_digest is None else [before.frame_digest]
+        if isinstance(inputs.known, KnownDrives):
+            held += [season.digests() for season in inputs.known.seasons]
+        if held and np.isin(drive.digests(), np.concatenate(held)).all():
             raise InvalidMapConfigError(
                 f"map {record.version}, which serves, holds every frame of traverse {config.training_traverse} "
                 "already, under another name: nothing is appended twice. Append another drive, or activate a map "
