@@ -28,7 +28,6 @@ from deepsimbad.store.layout import catalog_path
 log = logging.getLogger(__name__)
 
 _LONGEST_HOLD_S = 0.0005  # of the interpreter while others wait: at Python's 5 ms encoders stand still beside an answer
-_CONTAINERS_A_COLLECTION = 10_000  # answers leave no cycles, and at Python's 700 looking costs them a twentieth
 _ENCODER = json.JSONEncoder(default=str)
 _N_STANDARD = len(logging.makeLogRecord({}).__dict__)
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
@@ -126,7 +125,6 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         gc.collect()
         gc.freeze()  # what is there stays, and looking through it again would stop all answers for a tenth of a second
-        gc.set_threshold(_CONTAINERS_A_COLLECTION)
         sys.setswitchinterval(_LONGEST_HOLD_S)
         addresses = [listening.getsockname()[:2] for server in self.servers for listening in server.sockets]
         host, port = addresses[0]
