@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from bench.measurement import Timing, interleaved, machine, markdown, write_page
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
-from deepsimbad.evaluators.extractors.netvlad import STAGES, NetVlad
+from deepsimbad.evaluators.nets.netvlad import STAGES, NetVlad
 from deepsimbad.evaluators.runtimes import make_run
 
 CHANNELS = (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)

@@ -8,7 +8,7 @@ import torch
 from deepsimbad.errors import InvalidWeightsError, MissingPackageError
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.extractors import efficientnet_lite0 as module
-from deepsimbad.evaluators.extractors.networks import EfficientNetLite
+from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite
 from deepsimbad.evaluators.registry import make_extractor
 from deepsimbad.evaluators.runtimes import has_onnxruntime
 from deepsimbad.evaluators.weights.files import fill, load_checkpoint

@@ -6,8 +6,8 @@ import torch
 
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.extractors.netvlad import netvlad, read_netvlad
-from deepsimbad.evaluators.extractors.networks import SqueezeNet
 from deepsimbad.evaluators.extractors.squeezenet import CELLS, ENCODING_DIM, TAKEN, read_squeezenet, squeezenet
+from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
 from deepsimbad.evaluators.runtimes import has_onnxruntime
 
 from . import references

@@ -84,10 +84,8 @@ def weights_file() -> Path:
 
 
 def _module(weights: Path) -> "nn.Module":
-    from deepsimbad.evaluators.extractors.networks import (
-        EfficientNetLite,  # torch: a second to import
-        SpatialGrid,
-    )
+    from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite  # torch: a second to import
+    from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
 
     trunk = EfficientNetLite(tuple(_TAKEN))
     fill(trunk, load_checkpoint(weights), weights.name)

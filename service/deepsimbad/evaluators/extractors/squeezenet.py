@@ -52,7 +52,7 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
 
 
 def _module(path: Path) -> "nn.Module":
-    from deepsimbad.evaluators.extractors.networks import SpatialGrid
+    from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
 
     weights = read_squeezenet(path)
     preset = weights.preset
@@ -84,7 +84,7 @@ class SqueezeNetWeights:
 
     def trunk(self, taken: tuple[int, ...]) -> "nn.Module":
         """The network of these weights up to the last fire module taken; raises InvalidWeightsError."""
-        from deepsimbad.evaluators.extractors.networks import SqueezeNet
+        from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
 
         trunk = SqueezeNet(taken)
         fill(trunk, self.tensors, self.file)
