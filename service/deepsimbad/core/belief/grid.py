@@ -33,7 +33,7 @@ from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 
 _BLOCK = 1024  # cells whose sums stay in the first-level cache
-_ROUNDED = 1e-6  # of what differences of masses that sum to 1 leave, rounding may be too much
+_ROUNDED = 1e-6  # 1 less what is lost or leaves is summed anew below this, where rounding would be felt
 _NOTHING = 1e-300  # what a view leaves of a belief that it does not allow, or less
 
 
