@@ -14,7 +14,6 @@ from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from deepsimbad_campus.writer import write_campus
-from deepsimbad_client.recordings.nclt import NcltRecording
 
 # Compilation on a first call is no slowness of the code under test, and a run is the same everywhere.
 settings.register_profile("project", deadline=None, derandomize=True, print_blob=True)
@@ -61,29 +60,11 @@ def _one_at_a_time(tmp_path_factory, name: str) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory) -> Iterator[Path]:
-    """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed.
-
-    Nor is a frame read twice at one size by a test process, which takes longer than all that is done with it.
-    """
+def rendered(tmp_path_factory) -> Path:
+    """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed."""
     with _one_at_a_time(tmp_path_factory, "campus") as shared:
         write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
-    inodes = {path.stat().st_ino for path in (shared / "campus").rglob("*.tiff")}
-    read, kept = NcltRecording.image, {}
-
-    def image(self, frame, input_size):
-        path = self.folder / frame.name
-        number = path.stat().st_ino if path.exists() else 0  # it may be linked into another folder
-        if number not in inodes:
-            return read(self, frame, input_size)
-        known_as = number, self.rotate, input_size
-        if known_as not in kept:
-            kept[known_as] = read(self, frame, input_size)
-        return kept[known_as]
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(NcltRecording, "image", image)
-        yield shared / "campus"
+    return shared / "campus"
 
 
 @pytest.fixture(scope="session", autouse=True)
