@@ -441,6 +441,21 @@ def test_cells_of_a_loop_hear_of_a_view_between_the_places_beside_them(gap_m, of
     np.testing.assert_allclose(cells.of_places(values, offset_m * cells.step_m), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("n", [2, 3, 40])
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("offset", [-0.5, -0.2, 0.0, 0.3, 0.5])
+def test_cells_that_are_places_are_as_others(n, closed, offset):
+    """Of places at equal distances nothing is looked for; one that is off by a hair makes them be looked for."""
+    values, place_m = np.random.default_rng(0).random(n), 5 + 0.2 * np.arange(n)
+    off_m = place_m + 1e-5 * (np.arange(n) == n - 1)
+    same, looked_for = (Cells.along(at_m, 0.2 * (n if closed else n - 1), closed) for at_m in (place_m, off_m))
+    assert same.are_places
+    assert not looked_for.are_places
+    for of in ("of_places", "to_places"):
+        given = [getattr(cells, of)(values, offset * 0.2) for cells in (same, looked_for)]
+        np.testing.assert_allclose(*given, atol=1e-3)
+
+
 def test_the_same_seed_and_steps_give_the_same_bits():
     route = Route(np.arange(30.0))
 

@@ -14,6 +14,8 @@ SUMS = {"reassoc", "contract"}
 _MOST_PER_PLACE = 4  # cells, where a few places are far apart and the others near each other
 _MOST_IN_GAPS, _LEAST_STEP_M = 32768, 0.25  # more than that, but no shorter ones: gaps must not make cells coarse
 _ROUNDING = 1e-9  # of a cell
+_NOTHING = 1e-300  # of a mass that is almost wholly lost
+_SAME = 1e-6  # of a cell: how far places may be from its middles that are taken for them
 
 
 @dataclass(frozen=True)
@@ -61,14 +63,26 @@ class Cells:
         first = min(max(first, 0), self.n_cells)
         return slice(first, min(max(last + 1, first), self.n_cells))
 
+    @cached_property
+    def are_places(self) -> bool:
+        """Whether the places stand at equal distances, so that nothing must be looked for."""
+        same = self.place_m.size == self.n_cells
+        return same and bool((np.abs(self.place_m - self.position_m) <= _SAME * self.step_m).all())
+
     def of_places(self, values: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
         """[c] values at cells from those at places [p]: between two places the way leads from one to the other."""
+        if self.are_places:
+            return _shared(values, -offset_m / self.step_m, self.closed, False)
         length_m = self.step_m * self.n_cells if self.closed else 0.0
         return _interpolated(values, self.place_m, self.start_m + offset_m, self.step_m, self.n_cells, length_m)
 
     def to_places(self, mass: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
         """[p] masses of places, summing to 1, from those of cells [c]: of the stretch that is nearest to each."""
-        return _within(mass, self._bounds_m, self.start_m + offset_m, self.step_m, self.closed)
+        if self.are_places:
+            within = _shared(mass, offset_m / self.step_m, self.closed, True)
+        else:
+            within = _within(mass, self._bounds_m, self.start_m + offset_m, self.step_m, self.closed)
+        return within / max(float(within.sum()), _NOTHING)
 
     @cached_property
     def _bounds_m(self) -> NDArray[np.float64]:
@@ -79,6 +93,29 @@ class Cells:
         length_m = self.step_m * self.n_cells
         last_m = (self.place_m[-1] + self.place_m[0] + length_m) / 2
         return np.concatenate([[last_m - length_m], between_m, [last_m]])
+
+
+@njit(cache=True, nogil=True)
+def _shared(values: NDArray[np.float64], ahead: float, closed: bool, is_mass: bool) -> NDArray[np.float64]:
+    """[n] values so much of a step ahead, or behind where negative, shared out between the steps on either side.
+
+    Beyond an end of an open route a value is as it is there; of a mass nothing comes from there, and nothing is lost.
+    """
+    n, share = values.size, abs(ahead)
+    shared = np.empty(n)
+    if ahead >= 0:
+        first, last = 0, n - 1
+        for i in range(1, n):
+            shared[i] = values[i] + share * (values[i - 1] - values[i])
+    else:
+        first, last = n - 1, 0
+        for i in range(n - 1):
+            shared[i] = values[i] + share * (values[i + 1] - values[i])
+    before = values[last] if closed else 0.0 if is_mass else values[first]
+    shared[first] = values[first] + share * (before - values[first])
+    if is_mass and not closed:
+        shared[last] += share * values[last]
+    return shared
 
 
 @njit(cache=True, nogil=True)
@@ -129,4 +166,4 @@ def _within(
             at = at + 1 if at + 1 < n else 0
         held = mass[at] * max(last - cell, 0.0) if closed or cell < n else 0.0
         within[place] = total + held
-    return np.asarray(within / max(within.sum(), 1e-300))
+    return within

@@ -62,15 +62,15 @@ def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None
     of_map = map_.live_statistics
     if of_map is None or of_map.encodings is None or of_map.products is None:
         raise InvalidMapConfigError("the map does not know what is usual for encodings")
-    usual = live or of_map
-    if query.encoding is not None:
+    usual, products = live or of_map, query.products
+    # By the map's statistics the dissimilarities are already what the encoding would come to.
+    if query.encoding is not None and (live is not None or products is None):
         if query.encoding.shape[-1] != of_map.encodings.mean.size:
             d = of_map.encodings.mean.size
             raise InvalidInputError(f"an encoding of {query.encoding.shape[-1]} numbers; the map's have {d}")
         model = map_.landmark_model
         u = unit_encodings(query.encoding, usual.encodings or of_map.encodings, model.get("projection"))
         return np.asarray(u @ model["prototypes"].T, np.float32)
-    products = query.products
     if products is None:
         return np.asarray(of_map.products.mean - of_map.products.std * usual.ranks.view(query.ranks).z, np.float32)
     if live is None or live.products is None:
