@@ -1,4 +1,4 @@
-"""The application: its parts, in the order in which they start and stop; whether it is ready; the page of its calls."""
+"""The application: its parts, in the order in which they start and stop, and whether it is ready."""
 
 import asyncio
 import logging
@@ -12,19 +12,16 @@ from concurrent.futures import TimeoutError as TookTooLong
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, FastAPI, Request, Response
-from fastapi import Path as PathParameter
+from fastapi import APIRouter, FastAPI, Response
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import Field
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse
+from starlette.responses import PlainTextResponse
 
 from deepsimbad.api import (
-    console,
     coverage,
     domains,
     events,
@@ -32,6 +29,7 @@ from deepsimbad.api import (
     jobs,
     localizations,
     maps,
+    pages,
     sessions,
     traverses,
     whereabouts,
@@ -75,7 +73,7 @@ _FOLLOW_S = 1.0  # between two looks into a map store's log, of one small reques
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
     *(sessions.router, localizations.router, router, domains.router, domains.admin),
     *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
-    *(whereabouts.router, events.router, coverage.router, console.router),
+    *(whereabouts.router, events.router, coverage.router, pages.router),
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "
@@ -416,74 +414,3 @@ async def metrics(running: Running) -> Response:
     """What Prometheus scrapes."""
     content = await run_sync(running.metrics.render, limiter=running.health)
     return Response(content, media_type=CONTENT_TYPE_LATEST)
-
-
-# The page that shows the OpenAPI document, and all it needs: a robot's network reaches no other host.
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Deep SIMBAD</title>
-<link rel="stylesheet" href="docs/swagger-ui.css"><link rel="icon" href="data:,">
-</head>
-<body><div id="page"></div><script src="docs/swagger-ui-bundle.js"></script><script src="docs/start.js"></script></body>
-</html>
-"""
-# The validator is another host's; a key that was typed in is forgotten with the page.
-_START = """SwaggerUIBundle({
-  url: "openapi.json",
-  dom_id: "#page",
-  deepLinking: true,
-  persistAuthorization: false,
-  validatorUrl: null,
-});
-"""
-# Styles stand in the page's elements, so they cannot be forbidden there; scripts come from here alone.
-_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; font-src data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-_KEPT = {"Cache-Control": "public, max-age=3600"}
-
-
-_LINKS = {
-    "console": "console",
-    "documentation": "docs",
-    "openapi": "openapi.json",
-    "domains": "v1/domains",
-    "ready": "readyz",
-}
-_ROOT = (
-    '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-    "<title>Deep SIMBAD</title><h1>Deep SIMBAD</h1><ul>"
-    + "".join(f'<li><a href="{path}">{name}</a></li>' for name, path in _LINKS.items())
-    + "</ul></html>"
-)
-
-
-@router.get("/", include_in_schema=False)
-async def root(request: Request) -> Response:
-    """Where to go from here, for a browser as a page."""
-    if "text/html" in request.headers.get("accept", ""):
-        return Response(_ROOT, media_type="text/html")
-    return JSONResponse({"name": "Deep SIMBAD", "version": release(), **_LINKS})
-
-
-@router.get("/docs", include_in_schema=False)
-async def page() -> Response:
-    """Every call, to read and to try."""
-    return Response(_PAGE, media_type="text/html", headers={"Content-Security-Policy": _POLICY})
-
-
-@router.get("/docs/start.js", include_in_schema=False)
-async def start() -> Response:
-    """What draws the page."""
-    return Response(_START, media_type="text/javascript", headers=_KEPT)
-
-
-@router.get("/docs/{asset}", include_in_schema=False)
-async def asset(
-    name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], PathParameter(alias="asset")],
-) -> Response:
-    """Swagger UI, from the package that brings it."""
-    return FileResponse(Path(str(resources.files("fastapi_offline") / "static")) / name, headers=_KEPT)
