@@ -35,15 +35,15 @@ class View(NamedTuple):
     roll_rad: float = 0.0
 
     def to_camera(self, points: Array) -> Array:
-        """[n, 2] metres to the right of and ahead of the camera, of [n, 2] north and east."""
+        """[..., 2] metres to the right of and ahead of the camera, of [..., 2] north and east."""
         cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
         return np.asarray((points - (self.north_m, self.east_m)) @ np.array([[-sin, cos], [cos, sin]]), np.float64)
 
 
 def project(right_ahead: Array, height_m: Array | float = 0.0) -> Array:
-    """[n, 2] canvas pixels (x right, y down) of [n, 2] points right and ahead, before the view's pitch and roll."""
-    per_m = FOCAL_PX / np.maximum(right_ahead[:, 1], 1e-3)
-    return np.stack([CENTRE_X + right_ahead[:, 0] * per_m, HORIZON_Y + (EYE_M - height_m) * per_m], axis=1)
+    """[..., 2] canvas pixels (x right, y down) of [..., 2] points right and ahead, before the view's pitch and roll."""
+    per_m = FOCAL_PX / np.maximum(right_ahead[..., 1], 1e-3)
+    return np.stack([CENTRE_X + right_ahead[..., 0] * per_m, HORIZON_Y + (EYE_M - height_m) * per_m], axis=-1)
 
 
 def clip_near(polygon: Array) -> Array:
@@ -53,6 +53,12 @@ def clip_near(polygon: Array) -> Array:
     share = ahead / np.where(crossing, ahead - (following[:, 1] - NEAR_M), 1.0)
     cuts = polygon + share[:, None] * (following - polygon)
     return np.asarray(np.stack([polygon, cuts], axis=1)[np.stack([ahead >= 0, crossing], axis=1)], np.float64)
+
+
+def near_cut(ends: Array) -> Array:
+    """[2] what is left of a wall that goes past the camera, as shares of the way between its [2, 2] feet."""
+    z0, z1 = ends[:, 1]
+    return np.array([(NEAR_M - z0) / (z1 - z0) if z < NEAR_M else end for z, end in ((z0, 0.0), (z1, 1.0))])
 
 
 def sixteenths(pixels: Array) -> NDArray[np.int32]:

@@ -13,7 +13,7 @@ from deepsimbad_campus.camera import FOCAL_PX, GROUND_ROW, HEIGHT, HORIZON_Y, WI
 from deepsimbad_campus.route import Drive, stream
 from deepsimbad_campus.season import Light, season_of
 from deepsimbad_campus.things import Shot
-from deepsimbad_campus.world import BUSH, FIRST_CONIFER, SIGHT_M, World
+from deepsimbad_campus.world import SIGHT_M, World
 
 GRAIN = 4.0
 FACADES = 96  # pictures of walls kept; about 1 MB each
@@ -57,21 +57,19 @@ class Renderer:
 
     def canvas(self, frame: int, view: View) -> Image:
         """[728, 560, 3] BGR, the picture of a frame as drawn: upright, level and without grain."""
-        drive, canvas = self._drive, np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        clouds = 2.4 * (self._season.cloud_share - 0.5)
-        sunshine = float(np.clip(0.5 + 1.6 * (drive.sunniness[frame] - clouds), 0, 1))
-        light = Light(self._season, sunshine, float(drive.exposure[frame]))
-        time_s = int(drive.utime[frame] - drive.utime[0]) / 1e6
-        shot = Shot(canvas, view, light, float(drive.position_m[frame]), time_s)
+        season, drive, canvas = self._season, self._drive, np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        sunshine = float(np.clip(0.5 + 1.6 * (drive.sunniness[frame] - 2.4 * (season.cloud_share - 0.5)), 0, 1))
+        light = Light(season, sunshine, float(drive.exposure[frame]))
+        shot = Shot(canvas, view, light, float(drive.position_m[frame]), self.trees)
         self._paint_sky(shot, frame)
-        turn = (np.deg2rad(self._season.sun_azimuth_deg) - view.heading_rad + np.pi) % (2 * np.pi) - np.pi
+        turn = (np.deg2rad(season.sun_azimuth_deg) - view.heading_rad + np.pi) % (2 * np.pi) - np.pi
         x = int(camera.CENTRE_X + FOCAL_PX * np.tan(turn))
-        y = int(HORIZON_Y - FOCAL_PX * np.tan(np.deg2rad(self._season.sun_elevation_deg)) / np.cos(turn))
+        y = int(HORIZON_Y - FOCAL_PX * np.tan(np.deg2rad(season.sun_elevation_deg)) / np.cos(turn))
         dazzling = abs(turn) <= 1.05 and sunshine > 0.3
         if dazzling:
             self._glow(canvas, x, y, 1.5 * sunshine)
         self._paint_ground(shot)
-        self._draw_things(shot)
+        self._draw_things(shot, frame)
         if dazzling and 0 <= x < WIDTH and 0 <= y < HEIGHT and canvas[y, x].min() > 200:  # nothing stands before it
             self._glow(canvas, x, y, 0.8 * sunshine)
             rows = canvas[max(0, y - 1) : y + 2]  # it bleeds along the sensor's columns, which lie level
@@ -104,29 +102,18 @@ class Renderer:
         if roi.size:
             cv2.add(roi, np.clip(part * strength, 0, 255).astype(np.uint8), dst=roi)
 
-    def _draw_things(self, shot: Shot) -> None:
+    def _draw_things(self, shot: Shot, frame: int) -> None:
         queue: list[tuple[float, Callable[[], None]]] = []
-        drive, route, view = self._drive, self._world.route, shot.view
-
-        def stand(place: Array, margin_m: float, draw: Callable[[Array], None]) -> None:
-            foot = view.to_camera(place[None])[0]
-            if camera.NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * camera.HALF_VIEW + margin_m:
-                queue.append((foot[1], partial(draw, foot)))
-
         for section in self._world.ahead(shot.position_m):
             for feet, style in section.facades:
                 north, east = (feet[1] - feet[0]) / np.hypot(*(feet[1] - feet[0]))
                 gain = shot.light.gain(-east * shot.light.sun[0] + north * shot.light.sun[1])  # its normal points right
-                for ahead, ends, span in things.panels(feet, view):
+                for ahead, ends, span in things.panels(feet, shot.view):
                     queue.append((ahead, partial(things.draw_panel, shot, self._facade, style, gain, ends, span)))
-            for tree in section.trees:
-                stand(tree[0], 5.0, partial(things.draw_tree, shot, self.trees[tree[2]], tree))
-            for post in section.posts:
-                stand(post[0], 1.5, partial(things.draw_post, shot, post))
-            for car in (*things.parked(section, drive), *things.driving(section, drive, route, shot.time_s)):
-                stand(car[0], 3.0, partial(things.draw_car, shot, car))
-        for walker in things.walking(drive, route, shot.position_m, shot.time_s):
-            stand(walker[0], 1.0, partial(things.draw_person, shot, walker))
+        for thing in things.around(self._world, self._drive, frame):
+            kind, foot = things.KINDS[thing.kind], shot.view.to_camera(thing.place)
+            if camera.NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * camera.HALF_VIEW + kind.margin_m:
+                queue.append((foot[1], partial(kind.draw, shot, thing, foot)))
         for _, draw in sorted(queue, key=itemgetter(0), reverse=True):
             draw()
 
@@ -188,12 +175,12 @@ class Renderer:
                 reach = reach * min(1.0, LONGEST_SHADOW_M / max(np.hypot(*reach), 1e-6))
                 corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
                 outlines.append(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
-            for place, height, species, _ in section.trees:
-                reach, ahead = away * height * 0.62, shot.view.to_camera(place[None])[0, 1]
-                if species < BUSH and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
+            for place, kind, height, *_ in section.things:
+                reach, ahead = away * height * 0.62, shot.view.to_camera(place)[1]
+                if kind in ("tree", "conifer") and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
                     side = np.array([-along[1], along[0]]) * 0.12
                     outlines.append(place + np.stack([-side, side, reach + side, reach - side]))
-                    bare = leaves < 0.15 and species < FIRST_CONIFER
+                    bare = leaves < 0.15 and kind == "tree"
                     spread = circle * (height * (0.12 if bare else 0.16 + 0.12 * leaves))
                     outlines.append(place + reach + (spread + np.outer(spread @ along * (1 + 0.5 * long - 1), along)))
         for outline in outlines:

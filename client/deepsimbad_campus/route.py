@@ -1,7 +1,6 @@
 """The route, the drives along it and their ground truth: a campus before anything stands on it.
 
-A campus grows with its number of frames, so random numbers are drawn for a numbered block or in order: the first part
-of a long world is the short world.
+Random numbers are drawn for a numbered block or in order, so that the first part of a long world is the short world.
 """
 
 import datetime
@@ -19,8 +18,7 @@ MAX_HEADING_RAD = np.deg2rad(62)  # away from the general direction, so that the
 BLOCK = 100  # frames drawn from one block of randomness; a longer drive begins like a shorter one
 INTERVAL_US, TRUTH_STEP_US = 700_000, 10_000
 START_M, WIDEST_M = 2.0, 1.2
-LEAST_UNCOVERED = 100  # pictures of a drive of which some have no ground truth: more than a twentieth would be refused
-UNCOVERED_FIRST, UNCOVERED_LAST = 2.4, 1.4  # intervals between pictures without ground truth at both ends
+UNCOVERED = (2.4, 1.4)  # intervals between pictures without ground truth at both ends
 NAN_SHARE, NAN_FIRST = 0.004, 3
 
 
@@ -32,14 +30,13 @@ def stream(seed: int, name: str, block: int = 0) -> np.random.Generator:
 def smooth_line(rng: np.random.Generator, where: Array) -> Array:
     """[n] smooth noise at [n] places (not negative) along a line that has a standard normal knot at whole numbers."""
     left = where.astype(np.int64)
-    knots = rng.standard_normal(int(left.max()) + 2)
-    t = where - left
+    knots, t = rng.standard_normal(int(left.max()) + 2), where - left
     t = t * t * (3 - 2 * t)
     return np.asarray(knots[left] * (1 - t) + knots[left + 1] * t, np.float64)
 
 
 class Stretch(NamedTuple):
-    """A straight part of the route, where it begins along the route, and the bend that follows it."""
+    """A straight part of the route and the bend that follows it."""
 
     number: int
     start_m: float
@@ -49,10 +46,7 @@ class Stretch(NamedTuple):
 
 
 class Route:
-    """The centre line every drive follows, in the local north-east plane: stretches, never crossing themselves.
-
-    It is at least so long; the beginning of a longer route is the shorter route.
-    """
+    """The centre line every drive follows, in the local north-east plane: at least so long, never crossing itself."""
 
     def __init__(self, seed: int, length_m: float) -> None:
         rng = stream(seed, "route")
@@ -77,16 +71,16 @@ class Route:
         )
         self._position = np.arange(len(self._north)) * STEP_M
 
-    def heading(self, position_m: Array) -> Array:
-        """[n] heading of the centre line in radians, clockwise from north, at [n] route positions."""
-        return np.interp(position_m, self._position[:-1] + STEP_M / 2, self._heading)
+    def heading(self, position_m: Array | float) -> Array:
+        """[...] heading of the centre line in radians, clockwise from north, at [...] route positions."""
+        return np.asarray(np.interp(position_m, self._position[:-1] + STEP_M / 2, self._heading), np.float64)
 
-    def place(self, position_m: Array, right_m: Array | float = 0.0) -> Array:
-        """[n, 2] north and east, in metres, of the points `right_m` to the right of [n] route positions."""
+    def place(self, position_m: Array | float, right_m: Array | float = 0.0) -> Array:
+        """[..., 2] north and east, in metres, of the points `right_m` to the right of [...] route positions."""
         heading = self.heading(position_m)
         north = np.interp(position_m, self._position, self._north) - np.sin(heading) * right_m
         east = np.interp(position_m, self._position, self._east) + np.cos(heading) * right_m
-        return np.stack([north, east], axis=1)
+        return np.stack([north, east], axis=-1)
 
     def between(self, first_m: float, last_m: float) -> Array:
         """[n, 2] north and east of the centre line's samples between two route positions."""
@@ -143,11 +137,11 @@ class Drive:
         """[m, 7] utime (us), x (north), y (east), z (down) in metres, roll, pitch, yaw in radians, a block at a time.
 
         As NCLT publishes them, at about 100 Hz, with the quirks a reader must survive: the first and last few pictures
-        lie outside of the time covered (of a drive of fewer than 100, hardly any), and some rows hold NaN.
+        lie outside of the time covered (of a drive of fewer than 100 hardly any: it would be refused), and some rows
+        hold NaN.
         """
-        is_long = len(self.utime) >= LEAST_UNCOVERED
-        cut_first, cut_last = (UNCOVERED_FIRST, UNCOVERED_LAST) if is_long else (0.0, -1.0)
-        first, last = int(self.utime[0] + INTERVAL_US * cut_first), int(self.utime[-1] - INTERVAL_US * cut_last)
+        cuts = UNCOVERED if len(self.utime) >= BLOCK else (0.0, -1.0)
+        first, last = int(self.utime[0] + INTERVAL_US * cuts[0]), int(self.utime[-1] - INTERVAL_US * cuts[1])
         for block, start in enumerate(range(first, max(last, first + 1), BLOCK * INTERVAL_US)):
             rng = stream(self.seed, f"ground truth {self.date}", block)
             clock = np.arange(start, min(start + BLOCK * INTERVAL_US, last + 1), TRUTH_STEP_US)

@@ -11,7 +11,7 @@ from deepsimbad_campus.camera import FOCAL_PX, HEIGHT, NEAR_M, WIDTH, Array, Col
 from deepsimbad_campus.pictures import TREE_HEIGHT, TREE_WIDTH
 from deepsimbad_campus.route import INTERVAL_US, START_M, Drive, Route, stream
 from deepsimbad_campus.season import Light
-from deepsimbad_campus.world import SIGHT_M, Post, Section, Style, Tree
+from deepsimbad_campus.world import SIGHT_M, SIGNS, Section, Style, Thing, World
 
 CELL_M = 18.0  # people come in groups, one group or none for every so many metres of route
 PARKED_SHARE, PEOPLE_SHARE = 0.6, 0.8
@@ -28,8 +28,6 @@ BODY = np.array([(-2.1, 0.28), (-2.1, 0.95), (2.05, 0.82), (2.15, 0.28)]).T
 CABIN = np.array([(-1.8, 0.93), (-1.35, 1.48), (0.35, 1.46), (1.05, 0.86)]).T
 HALF_WIDTH_M = 0.86
 
-Car = tuple[Array, float, Colour]  # its place, heading in radians and paint
-Walker = tuple[Array, int, float]  # somebody's place, look (clothes and build) and stride
 Box = tuple[float, float, float, float, Colour]  # left, right, low and high in metres
 
 
@@ -39,33 +37,39 @@ class Shot(NamedTuple):
     canvas: Image
     view: View
     light: Light
-    position_m: float  # along the route
-    time_s: float  # since the drive began
+    position_m: float = 0.0  # along the route
+    trees: Sequence[Sequence[Image]] = ()  # pictures of every species and their halvings
 
 
-def parked(section: Section, drive: Drive) -> Iterator[Car]:
-    """The cars that stand in a section's bays during a drive."""
+def around(world: World, drive: Drive, frame: int) -> Iterator[Thing]:
+    """What stands or moves in sight of a frame, but for walls."""
+    position_m, time_s = drive.position_m[frame], int(drive.utime[frame] - drive.utime[0]) / 1e6
+    for section in world.ahead(position_m):
+        yield from section.things
+        yield from _cars(section, drive, world.route, time_s)
+    yield from _people(drive, world.route, position_m, time_s)
+
+
+def _cars(section: Section, drive: Drive, route: Route, time_s: float) -> Iterator[Thing]:
+    """Those that stand in a section's bays during a drive, and those on its road."""
     for place, heading, number in section.bays:
         rng = stream(drive.seed, f"bay {drive.date}", number)
         if rng.random() < PARKED_SHARE:
             turn = rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
-            yield place, heading + turn, CARS[rng.integers(0, len(CARS))]
+            yield Thing(place, "car", 1.5, int(rng.integers(0, len(CARS))), heading + turn)
+    if section.road_right_m is not None:
+        rng = stream(drive.seed, f"traffic {drive.date}", section.stretch.number)
+        for _ in range(rng.integers(1, 4)):
+            speed = rng.uniform(6, 11) * rng.choice([-1, 1])
+            along = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M
+            paint = int(rng.integers(0, len(CARS)))
+            if along <= section.stretch.straight_m:
+                where, lane = section.stretch.start_m + along, section.road_right_m + np.sign(speed) * LANE_M
+                turn = float(route.heading(where)) + (np.pi if speed < 0 else 0.0)
+                yield Thing(route.place(where, lane), "car", 1.5, paint, turn)
 
 
-def driving(section: Section, drive: Drive, route: Route, time_s: float) -> Iterator[Car]:
-    """The cars on a section's road, at a time since a drive began."""
-    rng = stream(drive.seed, f"traffic {drive.date}", section.stretch.number)
-    for _ in range(rng.integers(1, 4) if section.road_right_m is not None else 0):
-        speed = rng.uniform(6, 11) * rng.choice([-1, 1])
-        along = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M
-        paint = CARS[rng.integers(0, len(CARS))]
-        if along <= section.stretch.straight_m:
-            where, lane = np.array([section.stretch.start_m + along]), section.road_right_m + np.sign(speed) * LANE_M
-            yield route.place(where, lane)[0], route.heading(where)[0] + (np.pi if speed < 0 else 0.0), paint
-
-
-def walking(drive: Drive, route: Route, position_m: float, time_s: float) -> Iterator[Walker]:
-    """The people in sight of a route position, at a time since a drive began."""
+def _people(drive: Drive, route: Route, position_m: float, time_s: float) -> Iterator[Thing]:
     first, last = int(max(0.0, position_m - 2 * CELL_M) / CELL_M), int((position_m + SIGHT_M / 2) / CELL_M)
     for cell in range(first, last + 1):
         rng = stream(drive.seed, f"people {drive.date}", cell)
@@ -77,7 +81,7 @@ def walking(drive: Drive, route: Route, position_m: float, time_s: float) -> Ite
                 right, look = side * rng.uniform(0.9, 3.0), int(rng.integers(0, 1 << 31))
                 where = home + speed * float(np.clip(time_s - met_s, -40, 40)) + 0.9 * k
                 if where > 0:
-                    yield route.place(np.array([where]), right)[0], look, 2.2 * where if speed else 0.4
+                    yield Thing(route.place(where, right), "person", 1.75, look, 2.2 * where if speed else 0.4)
 
 
 def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
@@ -89,8 +93,7 @@ def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
     (x0, z0), (x1, z1) = ends = view.to_camera(feet)
     if x1 * z0 - x0 * z1 <= 0 or max(z0, z1) < NEAR_M or min(z0, z1) > SIGHT_M:
         return
-    first = (NEAR_M - z0) / (z1 - z0) if z0 < NEAR_M else 0.0
-    last = (NEAR_M - z0) / (z1 - z0) if z1 < NEAR_M else 1.0
+    first, last = camera.near_cut(ends)
     length, near = (last - first) * np.hypot(x1 - x0, z1 - z0), max(NEAR_M, min(z0, z1))
     cuts = np.linspace(first, last, int(np.ceil(length / max(5.0, 0.4 * near))) + 1)
     feet = ends[0] + cuts[:, None] * (ends[1] - ends[0])
@@ -122,11 +125,9 @@ def draw_panel(
     cv2.warpPerspective(part, bend, size, dst=roi, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_TRANSPARENT)
 
 
-def draw_tree(shot: Shot, levels: Sequence[Image], tree: Tree, foot: Array) -> None:
-    """Draw a tree whose foot is at metres right and ahead."""
-    (x, y), ahead, light = project(foot[None])[0], foot[1], shot.light
-    _, height_m, _, mirrored = tree
-    tall = FOCAL_PX * height_m / ahead
+def _draw_tree(shot: Shot, tree: Thing, foot: Array) -> None:
+    (x, y), ahead, light, levels = project(foot), foot[1], shot.light, shot.trees[tree.look]
+    tall = FOCAL_PX * tree.size_m / ahead
     scale = tall / TREE_HEIGHT
     wide = TREE_WIDTH * scale
     left, right = max(0, int(x - wide / 2)), min(WIDTH, int(x + wide / 2) + 1)
@@ -134,8 +135,8 @@ def draw_tree(shot: Shot, levels: Sequence[Image], tree: Tree, foot: Array) -> N
     if left >= right or top >= bottom:
         return
     picture = levels[int(np.clip(np.log2(max(1.0, 1 / scale)), 0, len(levels) - 1))]
-    side, grow_x, grow_y = -1 if mirrored else 1, wide / picture.shape[1], tall / picture.shape[0]
-    place = np.array([[side * grow_x, 0, x - side * wide / 2 - left], [0, grow_y, y - tall - top]])
+    grow_x, grow_y = wide / picture.shape[1], tall / picture.shape[0]
+    place = np.array([[tree.turn * grow_x, 0, x - tree.turn * wide / 2 - left], [0, grow_y, y - tall - top]])
     part = cv2.warpAffine(picture, place, (right - left, bottom - top), flags=cv2.INTER_LINEAR)
     colour, alpha = cv2.cvtColor(part, cv2.COLOR_BGRA2BGR), cv2.merge([part[:, :, 3]] * 3)
     share, shades = light.haze(ahead), np.arange(256)[:, None]
@@ -149,12 +150,11 @@ def draw_tree(shot: Shot, levels: Sequence[Image], tree: Tree, foot: Array) -> N
     cv2.add(roi, colour, dst=roi)
 
 
-def draw_car(shot: Shot, car: Car, centre: Array) -> None:
-    """Draw a car at metres right and ahead."""
-    (_, heading, paint), light, distance = car, shot.light, centre[1]
+def _draw_car(shot: Shot, car: Thing, centre: Array) -> None:
+    paint, light, distance = CARS[car.look], shot.light, centre[1]
     if distance < NEAR_M + 2.8:
         return
-    turn = heading - shot.view.heading_rad
+    turn = car.turn - shot.view.heading_rad
     nose, side = np.array([np.sin(turn), np.cos(turn)]), np.array([np.cos(turn), -np.sin(turn)])
 
     def face(ground: Array, heights: Array, colour: Colour, gain: Array) -> None:
@@ -179,12 +179,11 @@ def draw_car(shot: Shot, car: Car, centre: Array) -> None:
         face(hub + nose * 0.33 * np.cos(ring)[:, None], 0.33 + 0.33 * np.sin(ring), (24, 24, 26), light.in_shade)
 
 
-def draw_person(shot: Shot, walker: Walker, foot: Array) -> None:
-    """Draw somebody walking, at metres right and ahead."""
-    (_, look, stride), ahead = walker, foot[1]
+def _draw_person(shot: Shot, walker: Thing, foot: Array) -> None:
+    ahead = foot[1]
     if ahead < 0.9:
         return
-    rng, swing, gain = np.random.default_rng(look), 0.16 * np.sin(stride), shot.light.between(0.5)
+    rng, swing, gain = np.random.default_rng(walker.look), 0.16 * np.sin(walker.turn), shot.light.between(0.5)
     unit = FOCAL_PX / ahead * rng.uniform(1.58, 1.9) / 1.75
     coat = COATS[rng.integers(0, len(COATS))]
     legs = (70, 52, 40) if rng.random() < 0.6 else (44, 44, 46)
@@ -197,28 +196,52 @@ def draw_person(shot: Shot, walker: Walker, foot: Array) -> None:
         cv2.circle(shot.canvas, centre, max(1, round(size * unit)), ink, -1, cv2.LINE_AA)
 
 
-def draw_post(shot: Shot, post: Post, foot: Array) -> None:
-    """Draw a lamp, sign, bollard or bench at metres right and ahead."""
-    _, kind, size, colour = post
-    boxes: list[Box] = [(-0.06, 0.06, 0, size, METAL), (-0.16, 0.16, 0, 0.35, METAL)]
-    boxes += [(-0.22, 0.22, size, size + 0.45, (205, 215, 220)), (-0.26, 0.26, size + 0.42, size + 0.52, METAL)]
-    if kind == "sign":
-        boxes = [(-0.04, 0.04, 0, size, METAL), (-0.38, 0.38, size - 0.75, size, colour)]
-        boxes += [(-0.28, 0.28, size - 0.45, size - 0.32, (230, 230, 230))]
-    elif kind == "bollard":
+def _draw_post(shot: Shot, post: Thing, foot: Array) -> None:
+    size, boxes = post.size_m, list[Box]()
+    if post.kind == "lamp":
+        boxes = [(-0.06, 0.06, 0, size, METAL), (-0.16, 0.16, 0, 0.35, METAL)]
+        boxes += [(-0.22, 0.22, size, size + 0.45, (205, 215, 220)), (-0.26, 0.26, size + 0.42, size + 0.52, METAL)]
+    elif post.kind == "bollard":
         boxes = [(-0.1, 0.1, 0, size, METAL), (-0.1, 0.1, size * 0.7, size * 0.82, (60, 200, 220))]
-    elif kind == "bench":
+    elif post.kind == "bench":
         boxes = [(-size / 2, size / 2, 0.42, 0.5, WOOD), (-size / 2, size / 2, 0.62, 0.88, WOOD)]
         boxes += [(leg * size, leg * size + 0.07, 0, 0.88, METAL) for leg in (-0.42, 0.36)]
+    else:
+        boxes = [(-0.04, 0.04, 0, size, METAL), (-0.38, 0.38, size - 0.75, size, SIGNS[post.kind])]
+        boxes += [(-0.28, 0.28, size - 0.45, size - 0.32, (230, 230, 230))]
     if foot[1] >= 0.8:
         _draw_boxes(shot, boxes, foot, FOCAL_PX / foot[1], shot.light.between(0.4))
 
 
 def _draw_boxes(shot: Shot, boxes: Sequence[Box], foot: Array, unit: float, gain: Array, taper: float = 1.0) -> Array:
     """Draw upright boxes around a foot, so many pixels a metre; returns the foot's pixel."""
-    pixel: Array = project(foot[None])[0]
+    pixel = project(foot)
     for left, right, low, high, colour in boxes:
         corners = np.array([(left, low), (right, low), (right * taper, high), (left * taper, high)])
         ink = shot.light.colour(colour, gain, foot[1])
         cv2.fillConvexPoly(shot.canvas, sixteenths(pixel + corners * (unit, -unit)), ink, cv2.LINE_AA, 4)
     return pixel
+
+
+class Kind(NamedTuple):
+    """How a thing is drawn, given its foot in metres right and ahead, and what an observer takes it for."""
+
+    draw: Callable[[Shot, Thing, Array], None]
+    margin_m: float  # how far beside the view it may stand and still reach into it
+    half_m: tuple[float, float]  # half its width: metres, and share of its size
+    height_m: tuple[float, float] = (0, 1)  # likewise
+
+    def measures(self, size_m: float) -> tuple[float, float]:
+        """Metres of half its width and of its height."""
+        return self.half_m[0] + self.half_m[1] * size_m, self.height_m[0] + self.height_m[1] * size_m
+
+
+KINDS = {
+    **dict.fromkeys(("tree", "conifer", "bush"), Kind(_draw_tree, 5.0, (0, 0.35))),
+    **dict.fromkeys(SIGNS, Kind(_draw_post, 1.5, (0.38, 0))),
+    "lamp": Kind(_draw_post, 1.5, (0.26, 0), (0.5, 1)),
+    "bollard": Kind(_draw_post, 1.5, (0.1, 0)),
+    "bench": Kind(_draw_post, 1.5, (0, 0.5), (0.88, 0)),
+    "car": Kind(_draw_car, 3.0, (1.7, 0)),
+    "person": Kind(_draw_person, 1.0, (0.3, 0)),
+}

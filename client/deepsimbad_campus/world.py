@@ -1,4 +1,4 @@
-"""What stands along the route, the same in every season: buildings, trees, paving and posts, by kind of stretch."""
+"""What stands along the route, the same in every season: buildings, things and paving, by kind of stretch."""
 
 from typing import NamedTuple
 
@@ -15,12 +15,23 @@ DECK = ("court", "street", "avenue", "twins", "field", "wall", "parking", "twins
 BAY_NUMBERS = 64
 FIRST_CONIFER, BUSH = 11, 14
 MATERIALS = ("brick", "sandstone", "concrete", "plaster", "glass", "brick")
-SIGN_COLOURS = ((40, 40, 190), (150, 70, 20), (40, 130, 40), (30, 170, 220), (200, 200, 200))
-POST_SIZES_M = {"lamp": 5.0, "sign": 2.3, "bollard": 0.9, "bench": 1.6, "bush": 1.3}
+SIGNS: dict[str, Colour] = {
+    "red sign": (40, 40, 190), "blue sign": (150, 70, 20), "green sign": (40, 130, 40),
+    "yellow sign": (30, 170, 220), "white sign": (200, 200, 200),
+}  # fmt: skip
+SIZES_M = {"lamp": 5.0, "sign": 2.3, "bollard": 0.9, "bench": 1.6, "bush": 1.3}  # on average
 
-Tree = tuple[Array, float, int, bool]  # its place, height in metres, species (or BUSH), whether it is mirrored
-Post = tuple[Array, str, float, Colour]  # its place, kind, size in metres and colour
 Bay = tuple[Array, float, int]  # where a car may stand, its heading in radians, a number of the bay
+
+
+class Thing(NamedTuple):
+    """Something on the ground that shows the camera one face, wherever it is seen from."""
+
+    place: Array
+    kind: str
+    size_m: float  # height; of a bench its length
+    look: int = 0  # a tree's species, a car's paint, seed of a walker's clothes
+    turn: float = 0.0  # a car's heading, a walker's stride; -1 of a mirrored tree
 
 
 class Style(NamedTuple):
@@ -71,14 +82,13 @@ class Section:
         self.stretch, self._rng, self._built = stretch, rng, built
         self.blocks: list[Block] = []
         self.facades: list[tuple[Array, Style]] = []  # [2, 2] feet of a wall's left and right edge, seen from outside
-        self.trees: list[Tree] = []
-        self.posts: list[Post] = []
+        self.things: list[Thing] = []
         self.bays: list[Bay] = []
         self.patches: list[tuple[Array, str]] = []  # [4, 2] a paved piece of ground, and with what
         self.road_right_m: float | None = None
-        start = np.array([stretch.start_m + 0.25])
-        self.heading_rad = heading = float(route.heading(start)[0])
-        self._origin = route.place(start)[0]
+        start = stretch.start_m + 0.25
+        self.heading_rad = heading = float(route.heading(start))
+        self._origin = route.place(start)
         self._axes = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
         self._line = route.between(stretch.start_m - 160, stretch.end_m + 160)
         self.path_half_width_m = rng.uniform(1.3, 2.2)
@@ -88,8 +98,7 @@ class Section:
         # What every stretch has: distant buildings and bushes, trees at its bend, perhaps a crossing path.
         if zone not in ("field", "wall"):
             self._row(-1 if rng.random() < 0.5 else 1, (45, 70), 0.5, (9, 26))
-            for _ in range(rng.integers(1, 5)):
-                self._post("bush")
+            self._posts("bush", int(rng.integers(1, 5)))
         for _ in range(rng.integers(2, 6)):
             self._tree(rng.uniform(length, length + stretch.bend_m), rng.uniform(-25, 25), clearance=4.5)
         if rng.random() < 0.6:
@@ -138,20 +147,21 @@ class Section:
         """Plant a tree, if there is room, of any species and height where none is given."""
         place, rng = self._point(along, right), self._rng
         species = int(rng.integers(0, BUSH)) if species < 0 else species
-        tree = (place, height or rng.uniform(6, 13), species, rng.random() < 0.5)
-        if self._free(place, clearance):
-            self.trees.append(tree)
+        kind, height = "conifer" if species >= FIRST_CONIFER else "tree", height or rng.uniform(6, 13)
+        self._put(Thing(place, kind, height, species, -1.0 if rng.random() < 0.5 else 1.0), clearance)
 
-    def _post(self, kind: str, along: float = -1.0) -> None:
-        """Put a post or bush beside the path, if there is room, anywhere along it where no place is given."""
+    def _posts(self, kind: str, count: int = 1, at_m: float | None = None) -> None:
+        """Put posts or bushes beside the path, where there is room, anywhere along it where no place is given."""
         rng = self._rng
-        along = rng.uniform(0, self.stretch.straight_m) if along < 0 else along
-        place = self._point(along, rng.choice([-1, 1]) * rng.uniform(2.8, 6))
-        colour, size = SIGN_COLOURS[rng.integers(0, len(SIGN_COLOURS))], POST_SIZES_M[kind] * rng.uniform(0.8, 1.3)
-        if self._free(place, 2.5) and kind == "bush":
-            self.trees.append((place, size, BUSH, False))
-        elif self._free(place, 2.5):
-            self.posts.append((place, kind, size, colour))
+        for _ in range(count):
+            along = rng.uniform(0, self.stretch.straight_m) if at_m is None else at_m
+            place = self._point(along, rng.choice([-1, 1]) * rng.uniform(2.8, 6))
+            sign, size = list(SIGNS)[rng.integers(0, len(SIGNS))], SIZES_M[kind] * rng.uniform(0.8, 1.3)
+            self._put(Thing(place, sign if kind == "sign" else kind, size, BUSH, 1.0), 2.5)
+
+    def _put(self, thing: Thing, clearance: float) -> None:
+        if self._free(thing.place, clearance):
+            self.things.append(thing)
 
     def _bay(self, along: float, right: float, turn: float = 0.0) -> None:
         place = self._point(along, right)
@@ -168,8 +178,7 @@ class Section:
         for _ in range(rng.integers(9, 17)):
             self._tree(rng.uniform(0, length), rng.choice([-1, 1]) * rng.uniform(3.8, 7))
         for kind in ("lamp", "sign", "bench", "bollard"):
-            for _ in range(rng.integers(1, 4)):
-                self._post(kind)
+            self._posts(kind, int(rng.integers(1, 4)))
 
     def _street(self, rng: np.random.Generator, length: float) -> None:
         side = int(rng.choice([-1, 1]))
@@ -178,13 +187,12 @@ class Section:
         self._row(side, (14, 18), 0.9, (6, 18))
         self._row(-side, (6, 9), 0.9, (6, 18))
         for along in np.arange(4.0, length, 22):
-            self._post("lamp", along)
+            self._posts("lamp", at_m=along)
         for along in np.arange(2.0, length - 4, 6.2):
             self._bay(along, middle - side * 2.6)
             if rng.random() < 0.6:
                 self._tree(along + 4, -side * rng.uniform(3.8, 5))
-        for _ in range(3):
-            self._post("sign")
+        self._posts("sign", 3)
 
     def _avenue(self, rng: np.random.Generator, length: float) -> None:
         species = int(rng.integers(0, 10))
@@ -194,8 +202,7 @@ class Section:
                 self._tree(along, side * rng.uniform(4.2, 4.8), species, height=height)
         for side in (-1, 1):
             self._row(side, (18, 30), 0.35, (6, 15))
-        for _ in range(2):
-            self._post("bench")
+        self._posts("bench", 2)
 
     def _twins(self, rng: np.random.Generator, length: float) -> None:
         """Buildings that look alike: places that are hard to tell apart."""
@@ -213,7 +220,7 @@ class Section:
             self._tree(rng.uniform(-10, length + 30), side * rng.uniform(45, 90))
         if rng.random() < 0.7:
             self._tree(rng.uniform(10, length), rng.uniform(8, 25))
-        self._post("bench")
+        self._posts("bench")
 
     def _wall(self, rng: np.random.Generator, length: float) -> None:
         side, size = rng.choice([-1, 1]), (length - 1, 0.4, rng.uniform(2.4, 3.4))
@@ -233,8 +240,7 @@ class Section:
         self._row(-side, (7, 12), 0.7, (5, 14))
         for _ in range(6):
             self._tree(rng.uniform(0, length), -side * rng.uniform(3.8, 6))
-        for _ in range(2):
-            self._post("lamp")
+        self._posts("lamp", 2)
 
 
 class World:

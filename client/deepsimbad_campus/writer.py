@@ -1,5 +1,6 @@
 """Writes drives to disk exactly as NCLT lays out its recordings."""
 
+import io
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +16,7 @@ from deepsimbad_campus.route import Drive, drive_length_m
 from deepsimbad_campus.season import PAPER_DATES, CampusError, drive_date
 from deepsimbad_campus.world import World
 
-TRUTH_FILE = "ground_truth/groundtruth_{}.csv"
+TRUTH_FILE, ORDER_FILE = "ground_truth/groundtruth_{}.csv", "campus.json"
 FORMAT = 1  # raised whenever the same seed would give other pictures
 JPEG_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, 7, cv2.IMWRITE_TIFF_ROWSPERSTRIP, 16)  # 7: JPEG; it needs rows by the eight
 
@@ -31,10 +32,9 @@ def write_campus(
 ) -> list[str]:
     """Render a drive for every season or ISO date (each once) along one route; returns them as sources.
 
-    Pictures go to `<root>/<date>/lb3/Cam5/<utime>.tiff`, 1616 x 1232 as stored (turn them 90 degrees clockwise),
-    what is told of them to `detections.jsonl` and `captions.csv` in `<root>/<date>`, and poses to
-    `<root>/ground_truth/groundtruth_<date>.csv`. Equal arguments give equal bytes. A call that was cut
-    short goes on where it stopped, and a call with more frames adds to those that are there.
+    Pictures go to `<root>/<date>/lb3/Cam5/<utime>.tiff`, 1616 x 1232 as stored (turn them 90 degrees clockwise), what
+    is told of them to `<root>/<date>`, poses to `<root>/ground_truth/groundtruth_<date>.csv`. Equal arguments give
+    equal bytes. A call that was cut short goes on where it stopped; one with more frames adds to those there.
 
     Raises:
         CampusError: A season that cannot be; or the folder holds a drive made with other arguments or more frames, or
@@ -48,7 +48,7 @@ def write_campus(
         _refuse_another(root, f"{date}", order)
     world = World(seed, drive_length_m(n_frames, spacing_m))
     for date in dates:
-        _replace(root / f"{date}" / "campus.json", (json.dumps(order, indent=2) + "\n").encode())
+        _replace(root / f"{date}" / ORDER_FILE, (json.dumps(order, indent=2) + "\n").encode())
         for _ in _write_drive(root, world, Drive(world.route, seed, date, n_frames, spacing_m)):
             n_written += 1
             on_progress(n_written, len(dates) * n_frames)
@@ -57,7 +57,7 @@ def write_campus(
 
 def _refuse_another(root: Path, date: str, order: dict[str, float]) -> None:
     """Never mix a drive with one made otherwise, or with a real recording."""
-    folder, file = root / date, root / date / "campus.json"
+    folder, file = root / date, root / date / ORDER_FILE
     if not file.exists():
         if (folder / "lb3").exists() or (root / TRUTH_FILE.format(date)).exists():
             raise CampusError(f"{root} holds {date}, but not as a rendered campus: choose another folder")
@@ -73,19 +73,18 @@ def _refuse_another(root: Path, date: str, order: dict[str, float]) -> None:
 
 def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
     """Write what is missing of a drive; yields once for every picture there is."""
-    truth, folder = root / TRUTH_FILE.format(drive.date), root / f"{drive.date}" / "lb3" / "Cam5"
-    truth.parent.mkdir(parents=True, exist_ok=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    part = truth.with_name(f".{truth.name}.part")
-    with part.open("w", encoding="ascii", newline="\n") as rows_file:
-        for rows in drive.ground_truth():
-            np.savetxt(rows_file, rows, fmt=["%d", *["%.6f"] * 6], delimiter=",")
-    part.replace(truth)
-    for left in folder.glob(".*.part"):  # of a call that was cut short
+    truth, folder = io.StringIO(), root / f"{drive.date}"
+    for rows in drive.ground_truth():
+        np.savetxt(truth, rows, fmt=["%d", *["%.6f"] * 6], delimiter=",")
+    _replace(root / TRUTH_FILE.format(drive.date), truth.getvalue().encode())
+    files = [folder / "lb3" / "Cam5" / f"{utime}.tiff" for utime in drive.utime]
+    for left in files[0].parent.glob(".*.part"):  # of a call that was cut short
         left.unlink(missing_ok=True)
-    files = [folder / f"{utime}.tiff" for utime in drive.utime]
-    _tell(root / f"{drive.date}", world, drive, [file.name for file in files])
     missing = [frame for frame, file in enumerate(files) if not file.exists()]
+    if missing or not (folder / CAPTIONS).exists():
+        told = Observer(world, drive).files([file.name for file in files])
+        for name, body in zip((DETECTIONS, CAPTIONS), told, strict=True):
+            _replace(folder / name, body)
     yield from [None] * (len(files) - len(missing))
     if missing:
         renderer = Renderer(world, drive)
@@ -95,15 +94,6 @@ def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
 
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="campus") as pool:
             yield from pool.map(write, missing)
-
-
-def _tell(folder: Path, world: World, drive: Drive, names: list[str]) -> None:
-    """Write what a detector and a person say of the pictures, where that is not there of so many."""
-    files = folder / DETECTIONS, folder / CAPTIONS
-    said = [file.read_bytes().count(b"\n") if file.exists() else 0 for file in files]
-    if said != [len(names), len(names) + 1]:
-        for file, body in zip(files, Observer(world, drive).files(names), strict=True):
-            _replace(file, body)
 
 
 def _replace(file: Path, body: bytes) -> None:

@@ -64,7 +64,7 @@ STYLE = Style(5, "brick", 10.0, 6.0, 2, 3.0, True)
 
 def _wall_on_black(feet):
     season, view, canvas = season_of(drive_date("summer"), 0), View(0, 0, 0), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    shot, levels = Shot(canvas, view, Light(season, 1.0, 1.0), 0.0, 0.0), draw_facade(STYLE, season, 1)
+    shot, levels = Shot(canvas, view, Light(season, 1.0, 1.0)), draw_facade(STYLE, season, 1)
     for _, ends, span in panels(np.array(feet, float), view):
         draw_panel(shot, lambda style: levels, STYLE, shot.light.on_ground, ends, span)
     return canvas

@@ -83,7 +83,7 @@ def test_ground_truth_is_where_the_pictures_are_taken_with_the_quirks_of_the_rea
 
 def _things(world, length_m):
     near = [section for section in world.sections if section.stretch.start_m < length_m]
-    placed = [(*thing[0], *thing[1:]) for at in near for thing in (*at.trees, *at.posts, *at.bays)]
+    placed = [(*thing[0], *thing[1:]) for at in near for thing in (*at.things, *at.bays)]
     return placed + [(*feet.ravel(), style) for at in near for feet, style in at.facades]
 
 
@@ -97,7 +97,7 @@ def test_nothing_stands_on_the_route_and_walls_look_outward(seed):
     world = World(seed, 1200)
     line = world.route.between(0, 1500)
     for section in world.sections:
-        for place, *_ in (*section.trees, *section.posts, *section.bays):
+        for place, *_ in (*section.things, *section.bays):
             assert np.hypot(*(line - place).T).min() >= 2.5
         for n, block in enumerate(section.blocks):
             for feet, _ in section.facades[4 * n : 4 * n + 4]:
