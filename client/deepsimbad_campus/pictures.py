@@ -16,7 +16,7 @@ WALLS: dict[str, Colour] = {
 }  # fmt: skip
 PAVING: dict[str, Colour] = {"concrete": (164, 170, 172), "asphalt": (92, 92, 92), "paving": (118, 136, 158)}
 TREE_WIDTH, TREE_HEIGHT, LEAVES = 320, 400, 3000
-TILE_PX, TILE_M, TILE_LEVELS = 1024, 12.8, 5
+TILE_PX, TILE_M = 1024, 12.8
 SKY_PX_PER_DEG, SKY_TOP_DEG = 4, 68
 
 
@@ -40,11 +40,11 @@ def tile_noise(
     return total / max(float(total.std()), 1e-6)
 
 
-def _halvings(picture: Image) -> tuple[Image, ...]:
+def _halvings(picture: Image, border: int = cv2.BORDER_DEFAULT) -> tuple[Image, ...]:
     """A picture and its halvings, largest first."""
     levels = [picture]
     while min(levels[-1].shape[:2]) >= 12 and len(levels) < 6:
-        levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.uint8))
+        levels.append(np.asarray(cv2.pyrDown(levels[-1], borderType=border), np.uint8))
     return tuple(levels)
 
 
@@ -223,17 +223,13 @@ def _bush(colour: Image, alpha: Image, rng: np.random.Generator, season: Season)
         cv2.circle(alpha, (x, y), radius, 255, -1, cv2.LINE_AA)
 
 
-def draw_ground(season: Season, drive: str, seed: int) -> list[list[Image]]:
+def draw_ground(season: Season, drive: str, seed: int) -> list[tuple[Image, ...]]:
     """Grass, concrete, asphalt and paving for one drive: tiles that repeat without a seam, and their halvings."""
     surfaces = []
     for name in ("grass", *PAVING):
         rng = stream(seed, f"ground {name} {drive}")
         tile = _cover(_tile(name, season, rng), season, rng, name in PAVING)
-        levels = [np.clip(tile, 0, 255).astype(np.uint8)]
-        while len(levels) < TILE_LEVELS:  # a tile wraps around, so it is halved with its neighbours beside it
-            wide = np.pad(levels[-1], ((8, 8), (8, 8), (0, 0)), mode="wrap")
-            levels.append(np.ascontiguousarray(cv2.pyrDown(wide)[4:-4, 4:-4]))
-        surfaces.append(levels)
+        surfaces.append(_halvings(np.clip(tile, 0, 255).astype(np.uint8), cv2.BORDER_WRAP))
     return surfaces
 
 

@@ -46,9 +46,7 @@ def serving(command: Command) -> Command:
         "--server", envvar=URL_VARIABLE, default=DEFAULT_URL, show_default=True, show_envvar=True, metavar="URL"
     )
     @click.option(
-        "--api-key",
-        envvar=KEY_VARIABLE,
-        help=f"Better kept in ${KEY_VARIABLE}: a command line can be read by others.",
+        "--api-key", envvar=KEY_VARIABLE, help=f"Better kept in ${KEY_VARIABLE}: a command line can be read by others."
     )
     @wraps(command)
     def connected(server: str, api_key: str | None, **options: Any) -> None:

@@ -53,6 +53,11 @@ class Placed:
         self.left_out_names |= later.left_out_names
         self.remarks += later.remarks
 
+    def put_at(self, position_m: Reals) -> None:
+        """Say where along the route each of the frames [n] is."""
+        places = zip(self.frames, position_m.tolist(), strict=True)
+        self.frames = [dataclasses.replace(frame, position_m=at) for frame, at in places]
+
     def number(self) -> None:
         """Count the frames' indices from 0."""
         self.frames = [dataclasses.replace(frame, index=index) for index, frame in enumerate(self.frames)]
@@ -85,12 +90,7 @@ def placed(frames: Sequence[Frame], where: str, deadband_m: float = DEADBAND_M) 
 
 
 def placed_on(
-    track: Track,
-    images: Sequence[tuple[str, int]],
-    where: str,
-    what: str = "the positions",
-    *,
-    together: bool = False,
+    track: Track, images: Sequence[tuple[str, int]], where: str, what: str = "the positions", *, together: bool = False
 ) -> Placed:
     """Put images, names and microseconds, where a track was at their times. Raises SourceError (none is on it).
 
@@ -228,10 +228,7 @@ def _measure(result: Placed, time_us: Times | None, where: str) -> None:
     _without_spikes(result, usable, x_m, y_m)
     along_m = arc_length_m(x_m[usable], y_m[usable], None if time_us is None else time_us[usable], result.deadband_m)
     _tell_standing(result, float(along_m[-1]), "x_m, y_m are no metres (degrees go into columns latitude, longitude)")
-    result.frames = [
-        dataclasses.replace(frame, position_m=position_m)
-        for frame, position_m in zip(result.frames, along_m.tolist(), strict=True)
-    ]
+    result.put_at(along_m)
 
 
 def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
@@ -245,10 +242,8 @@ def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
     turned_m, usable = (-fallen, falls) if falls.sum() > rises.sum() else (risen, rises)
     n_back = int((~usable).sum())
     if n_back > MOST_LEFT_OUT * len(usable):
-        names, upwards = (
-            [frame.name for frame in result.frames],
-            -position_m if falls.sum() > rises.sum() else position_m,
-        )
+        names = [frame.name for frame in result.frames]
+        upwards = -position_m if falls.sum() > rises.sum() else position_m
         farthest = np.maximum.accumulate(upwards)
         at = int(np.argmax(upwards < farthest - back_tolerance_m(position_m)))
         before = int(np.argmax(upwards[:at]))
@@ -260,10 +255,7 @@ def _use_stated(result: Placed, time_us: Times | None, where: str) -> None:
         )
     result.leave_out(usable.tolist(), "where the position goes back")
     _tell_standing(result, float(np.ptp(turned_m[usable])), "position_m is not in metres")
-    result.frames = [
-        dataclasses.replace(frame, position_m=at)
-        for frame, at in zip(result.frames, turned_m[usable].tolist(), strict=True)
-    ]
+    result.put_at(turned_m[usable])
 
 
 def _refuse_turns(result: Placed, x_m: Reals, y_m: Reals, where: str) -> None:

@@ -25,10 +25,7 @@ MOST_SPIKES = 1000  # in a row, after which a track goes on
 MOST_NOISE_M = 10.0  # What leaps farther, as frames of two drives by turns, is none
 FEWEST_BY_TURNS, BACK_WITHIN, LEAP_BY_TURNS_M = 10, 4, 3.0  # of several drives' frames by turns
 SPIKE_M, SPIKE_NOISES, SPIKE_SPEEDS = 0.5, 8.0, 5.0
-SLOWEST_LIMIT_M_S, FASTEST_M_S = (
-    5.0,
-    100.0,
-)  # Whatever its usual speed, a robot may drive the one, and none drives the other
+SLOWEST_LIMIT_M_S, FASTEST_M_S = 5.0, 100.0  # Whatever its usual speed, a robot may drive the one, none the other
 
 Reals = NDArray[np.float64]
 Times = NDArray[np.int64]

@@ -61,12 +61,7 @@ def watch_episode(
 
 
 def watch_session(
-    client: Client,
-    session_id: str,
-    console: Console,
-    *,
-    every_s: float,
-    sleep: Callable[[float], None] = time.sleep,
+    client: Client, session_id: str, console: Console, *, every_s: float, sleep: Callable[[float], None] = time.sleep
 ) -> int:
     """Show a session that another robot drives, until it ends; it is left as it is. Returns how many changes were seen.
 

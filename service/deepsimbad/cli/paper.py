@@ -40,9 +40,8 @@ from deepsimbad.jobs.progress import Shares, in_threads
 from deepsimbad.release import release
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.encodings import ENCODING_SUFFIXES
 from deepsimbad_client.recordings.options import opened, reading
-from deepsimbad_client.recordings.sources import NCLT_PREFIX
+from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, NCLT_PREFIX
 
 _ENCODE_S = 0.05  # a frame, on one core of a server's
 _MOST_POINTS = 400  # of a trajectory as it is drawn

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import click
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from rich.console import Console
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 from rich.table import Table
 
@@ -171,6 +171,13 @@ evaluators_option = click.option(  # or `all`; given on as EvaluatorConfigs
 )
 
 
+def progress_bars(done: ProgressColumn) -> Bars:
+    """Bars on standard error; where that is no terminal, a log keeps an error's one line, and no blank ones."""
+    errors = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), done, TimeRemainingColumn())
+    return Bars(*columns, console=errors, transient=True, disable=not errors.is_terminal)
+
+
 @contextmanager
 def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -> Iterator[Progress]:
     """A progress bar over weighted stages; Ctrl-C cancels at the next report, and what that leaves is said."""
@@ -180,10 +187,7 @@ def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -
         nonlocal interrupted
         interrupted = True
 
-    errors = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    # Where it is no terminal, a log keeps an error's one line, and no blank ones.
-    bars = Bars(*columns, console=errors, transient=True, disable=not errors.is_terminal)
+    bars = progress_bars(TaskProgressColumn())
     task = bars.add_task(title, total=1.0)
 
     def show(state: ProgressState) -> None:

@@ -97,9 +97,7 @@ def try_(
             }
             with kept_encodings(out, role, **made_of) as kept:
                 encoded[role] = encode_recording(
-                    *(recording, measure, settings.max_pixels, progress.update),
-                    kept=kept,
-                    allow_missing=allow_missing,
+                    *(recording, measure, settings.max_pixels, progress.update), kept=kept, allow_missing=allow_missing
                 )
         drives = {role: each.drive for role, each in encoded.items()}
         truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)

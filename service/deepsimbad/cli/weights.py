@@ -10,9 +10,8 @@ from importlib.util import find_spec
 from typing import Any
 
 import click
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import DownloadColumn, TaskID
 from rich.table import Column, Table
 
 from deepsimbad.cli.terminal import (
@@ -23,6 +22,7 @@ from deepsimbad.cli.terminal import (
     json_list_option,
     json_option,
     print_table,
+    progress_bars,
     write_json,
 )
 from deepsimbad.errors import InvalidInputError, MissingWeightsError
@@ -190,9 +190,7 @@ def _agree(extractor: str, yes: bool) -> None:
 @contextmanager
 def _download_bar() -> Iterator[Tell]:
     """A progress bar on standard error for every file that comes."""
-    errors = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bars:
+    with progress_bars(DownloadColumn()) as bars:
         tasks: dict[str, TaskID] = {}
 
         def tell(name: str, n_bytes: int, n_in_all: int | None) -> None:

@@ -322,9 +322,7 @@ class InAnotherProcess:
     data_dir: Path
     n_threads: int  # the child computes in
     priority: JobPriority = JobPriority.IDLE
-    stops_within_s: float = (
-        3.0  # a child that does not stop so soon after a cancel is killed, which harms nothing either
-    )
+    stops_within_s: float = 3.0  # a child that takes longer after a cancel is killed, which harms nothing either
     compute: Compute = field(default_factory=Compute)  # how it computes networks
 
     def __call__(

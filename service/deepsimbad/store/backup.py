@@ -233,9 +233,7 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
             for n_done, member in enumerate(members):
                 on_progress(n_done / len(members))
                 _unpack(tar, file, member, staging)
-            for domain in {
-                domain for domain, _, _ in _listed_in(staging / _CATALOG, staging)
-            }:  # those without files too
+            for domain, _, _ in _listed_in(staging / _CATALOG, staging):  # of those without files too
                 layout.traverses_folder(staging, domain).mkdir(parents=True, exist_ok=True)
                 layout.maps_folder(staging, domain).mkdir(parents=True, exist_ok=True)
             for folder, _, _ in os.walk(staging, topdown=False):

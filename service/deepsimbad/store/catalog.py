@@ -253,11 +253,7 @@ class Catalog(MapCatalog, JobCatalog):
     # API keys. Rows are never deleted: whether a key was ever created decides whether the service runs open.
 
     def create_key(
-        self,
-        scope: KeyScope,
-        name: str = "",
-        lifetime: timedelta | None = None,
-        domains: Sequence[str] | None = None,
+        self, scope: KeyScope, name: str = "", lifetime: timedelta | None = None, domains: Sequence[str] | None = None
     ) -> tuple[KeyRecord, ApiKey]:
         """Make an API key; its secret is returned here and can never be had again.
 

@@ -349,11 +349,7 @@ def _chooser(name: str, runner: EpisodeRunner, config: NbvConfig) -> Chooser:
 
 
 def _episodes(
-    runner: EpisodeRunner,
-    starts: NDArray[np.int64],
-    choose: Chooser,
-    draws: bool,
-    on_progress: Callable[[float], None],
+    runner: EpisodeRunner, starts: NDArray[np.int64], choose: Chooser, draws: bool, on_progress: Callable[[float], None]
 ) -> list[Episode]:
     """Every start's episode; where nothing is drawn, equal starts have equal episodes and are run once."""
     driven: dict[int, Episode] = {}

@@ -44,10 +44,7 @@ class Pooled:
 
     def difference(self, name: str, rival: str, seed: int) -> Document:
         """A method's less its rival's, frame by frame."""
-        return {
-            "mean": self.mean(name) - self.mean(rival),
-            **self._intervals(self.sums[name] - self.sums[rival], seed),
-        }
+        return {"mean": self.mean(name) - self.mean(rival), **self._intervals(self.sums[name] - self.sums[rival], seed)}
 
     def _intervals(self, sums: NDArray[np.float64], seed: int) -> dict[str, list[float]]:
         """95 %, by stretches, and by test drives: of what other stretches and what other days would have shown."""

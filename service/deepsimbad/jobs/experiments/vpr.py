@@ -169,11 +169,7 @@ def build_maps(
     model: LandmarkModel | None = None
     for number, name in enumerate(config.relevances):
         plan = MapPlan(
-            name,
-            config.list_length,
-            ACTIONS_M,
-            same_route=config.same_route,
-            bars_own_place=config.bar_own_place,
+            name, config.list_length, ACTIONS_M, same_route=config.same_route, bars_own_place=config.bar_own_place
         )
         chosen = landmarks if name is Relevance.COMPOSED or model is None else model
         share = number / len(config.relevances)
