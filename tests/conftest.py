@@ -4,16 +4,21 @@ import fcntl
 import logging
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from deepsimbad_campus.writer import write_campus
+from deepsimbad_client.http import local_server
+
+from . import fork_server
 
 # Compilation on a first call is no slowness of the code under test, and a run is the same everywhere.
 settings.register_profile("project", deadline=None, derandomize=True, print_blob=True)
@@ -75,6 +80,16 @@ def _compiled(tmp_path_factory) -> None:
 
         with _one_at_a_time(tmp_path_factory, "kernels"):
             warm_up()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forked() -> Iterator[None]:
+    """A service that is no more than asked is forked rather than begun anew."""
+    with pytest.MonkeyPatch.context() as patched:
+        forking = SimpleNamespace(**{**vars(subprocess), "Popen": fork_server.Popen})
+        patched.setattr(local_server, "subprocess", forking)
+        yield
+    fork_server.SERVER.close()
 
 
 @pytest.fixture

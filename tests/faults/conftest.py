@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from ..commands import Ran, ran
+from ..fork_server import Popen
 
 READY_WITHIN_S = 180.0
 N_PLACES, DIM, N_LANDMARKS = 60, 8, 12
@@ -61,7 +62,7 @@ class Service:
         self.log: list[str] = []
 
     def __enter__(self) -> Self:
-        self._process = subprocess.Popen(
+        self._process = Popen(
             [*SERVE, "--port", str(self._port), "--data-dir", str(self._data_dir)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
