@@ -55,7 +55,7 @@ def real_data() -> Path:
 
 
 @contextmanager
-def _one_at_a_time(tmp_path_factory, name: str) -> Iterator[Path]:
+def one_at_a_time(tmp_path_factory, name: str) -> Iterator[Path]:
     """The folder of all test processes; the others of the same name wait."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
@@ -67,7 +67,7 @@ def _one_at_a_time(tmp_path_factory, name: str) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory) -> Path:
     """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed."""
-    with _one_at_a_time(tmp_path_factory, "campus") as shared:
+    with one_at_a_time(tmp_path_factory, "campus") as shared:
         write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
     return shared / "campus"
 
@@ -78,7 +78,7 @@ def _compiled(tmp_path_factory) -> None:
     if "PYTEST_XDIST_WORKER" in os.environ:
         from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - a second that a single file may do without
 
-        with _one_at_a_time(tmp_path_factory, "kernels"):
+        with one_at_a_time(tmp_path_factory, "kernels"):
             warm_up()
 
 

@@ -1,8 +1,8 @@
-"""Services of a process that has imported them once: a start of `deepsimbad serve` is mostly a second of imports.
+"""Services, and their jobs, of a process that has imported them once: of a start most are imports.
 
-`Popen` is the standard library's, but for this one command it asks the fork server, which every process of tests has of
-its own: what comes is a child of the caller like any other, with the arguments, environment, folder and streams it was
-given. Tests of the start itself take the standard library's.
+`Popen` is the standard library's, but for these two commands it asks the fork server, which every process of tests has
+of its own, and every service that it began: what comes is a child of the caller like any other, with the arguments,
+environment, folder, group and streams it was given. Tests of the start itself take the standard library's.
 """
 
 import ctypes
@@ -19,9 +19,8 @@ import threading
 from importlib import import_module
 from pathlib import Path
 
-COMMAND = ["-m", "deepsimbad", "serve"]
+COMMANDS = (["-m", "deepsimbad", "serve"], ["-P", "-m", "deepsimbad.jobs.child"])
 PROJECT = Path(__file__).resolve().parents[1]
-READ_AT_EVERY_START = ("DEEPSIMBAD_", "PYTEST_")  # other variables may count when something is imported
 # Of a start, what takes the longest.
 IMPORTED = ("deepsimbad.api.server", "deepsimbad.cli.serve", "anyio._backends._asyncio", "uvicorn.protocols.http.auto")
 PR_SET_CHILD_SUBREAPER = 36
@@ -29,7 +28,13 @@ ARGUMENTS = inspect.signature(subprocess.Popen._execute_child)
 
 
 def read_by_imports(environment):
-    return {name: value for name, value in environment.items() if not name.startswith(READ_AT_EVERY_START)}
+    """What may count when something is imported; here that is told to compute in one thread, which waits for none."""
+    read_later = ("DEEPSIMBAD_", "PYTEST_", "OPENBLAS_THREAD_TIMEOUT")
+    return {
+        name: value
+        for name, value in environment.items()
+        if not name.startswith(read_later) and not (name.endswith("_NUM_THREADS") and value == "1")
+    }
 
 
 class ForkServer:
@@ -41,12 +46,13 @@ class ForkServer:
     def takes(self, asked):
         """Whether a child forked here would be as one that begins anew."""
         unusual = [asked[name] for name in ("executable", "preexec_fn", "pass_fds", "shell", "start_new_session")]
-        words = list(map(str, asked["args"]))
+        program, *words = map(str, asked["args"])
         given = read_by_imports(os.environ if asked["env"] is None else asked["env"])
         return (
             sys.platform == "linux"
             and not any(unusual)
-            and words[: len(COMMAND) + 1] == [sys.executable, *COMMAND]
+            and program == sys.executable
+            and any(words[: len(command)] == command for command in COMMANDS)
             and given == (self._environment or read_by_imports(os.environ))
         )
 
@@ -64,11 +70,24 @@ class ForkServer:
                 libc.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
 
     def _begin(self):
-        self._environment = read_by_imports(os.environ)
         self._channel, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._environment = read_by_imports(os.environ)
         with its:
             command = [sys.executable, "-m", "tests.fork_server", str(its.fileno())]
             self._process = subprocess.Popen(command, cwd=PROJECT, pass_fds=[its.fileno()], stdin=subprocess.DEVNULL)
+
+    def divide(self):
+        """Begin as a copy of this process, which has imported all and is about to do something else."""
+        self._channel, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._environment = read_by_imports(os.environ)
+        if os.fork() == 0:
+            self._channel.close()
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            for number in range(3):
+                os.dup2(nowhere, number)
+            serve(its)
+            os._exit(0)
+        its.close()
 
     def close(self):
         """Children live on."""
@@ -90,9 +109,10 @@ class Popen(subprocess.Popen):
             return
         pipes = [asked[name] for name in ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")]
         start = {
-            "arguments": list(map(str, asked["args"][2:])),
+            "words": list(map(str, asked["args"])),
             "folder": os.fspath(asked["cwd"] or Path.cwd()),
             "environment": dict(os.environ if asked["env"] is None else asked["env"]),
+            "group": asked["process_group"],
         }
         streams = [number if pipe == -1 else pipe for number, pipe in enumerate((pipes[0], pipes[3], pipes[5]))]
         try:
@@ -118,23 +138,22 @@ def begin(start, streams):
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
     os.closerange(3, max(streams) + 1)
+    if start["group"] != -1:
+        os.setpgid(0, start["group"])
     os.chdir(start["folder"])
     os.environ.clear()
     os.environ.update(start["environment"])
-    sys.path[0] = start["folder"]
-    sys.argv = start["arguments"]
-    runpy.run_module("deepsimbad", run_name="__main__", alter_sys=True)
+    _, module, *arguments = start["words"][start["words"].index("-m") :]
+    sys.argv = [module, *arguments]
+    if module == "deepsimbad":
+        SERVER.divide()
+        subprocess.Popen = Popen
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
-def main():
-    channel = socket.socket(fileno=int(sys.argv[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends with the tests
-    gc.disable()
-    for module in IMPORTED:
-        import_module(module)
-    import_module("deepsimbad.engine.localizer").warm_up()
-    gc.freeze()
-    gc.enable()
+def serve(channel):
+    """Until nobody can ask any more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # meant for others
     reader, writer = os.pipe()
     while True:
         message, streams, _, _ = socket.recv_fds(channel, 1 << 20, 3)
@@ -143,9 +162,20 @@ def main():
         if orphan(writer):
             channel.detach()
             begin(json.loads(message), streams)
+            sys.exit()
         channel.send(os.read(reader, 100))
         for stream in streams:
             os.close(stream)
+
+
+def main():
+    gc.disable()
+    for module in IMPORTED:
+        import_module(module)
+    import_module("deepsimbad.engine.localizer").warm_up()
+    gc.freeze()
+    gc.enable()
+    serve(socket.socket(fileno=int(sys.argv[1])))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from ..commands import Ran, ran
+from ..conftest import one_at_a_time
 from ..fork_server import Popen
 
 READY_WITHIN_S = 180.0
@@ -178,8 +179,15 @@ REMAP = {
 
 @pytest.fixture(scope="session")
 def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data directory with two mapped domains, `loop` with two versions; never touched."""
-    data_dir = tmp_path_factory.mktemp("furnished") / "data"
+    """A data directory with two mapped domains, `loop` with two versions: for all test processes, never touched."""
+    with one_at_a_time(tmp_path_factory, "furnished") as shared:
+        if not (data_dir := shared / "furnished").is_dir():
+            furnish(making := tmp_path_factory.mktemp("furnished") / "data")
+            making.rename(data_dir)
+    return data_dir
+
+
+def furnish(data_dir: Path) -> None:
     with Service(data_dir) as service:
         for domain, n_maps in (("loop", 2), ("yard", 1)):
             body = {"evaluator": {"kind": "feature_l2", "extractor": "none"}, "closed": domain == "loop"}
@@ -190,7 +198,6 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for _ in range(n_maps):
                 job = service.told("POST", f"/v1/admin/domains/{domain}/remaps", json=REMAP)
                 assert service.ended_job(job["job_id"])["state"] == "succeeded"
-    return data_dir
 
 
 @pytest.fixture
