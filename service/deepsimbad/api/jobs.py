@@ -35,7 +35,7 @@ from deepsimbad.api.requests import (
 from deepsimbad.api.sessions import TruePositions
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import DeepSimbadError, NoActiveMapError, UnavailableError, UnknownJobError
-from deepsimbad.jobs.append import refuse_known_traverse
+from deepsimbad.jobs.append import camera_domain, refuse_known_traverse
 from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_TRAINING_EPISODES, RemapConfig, refuse_impossible
 from deepsimbad.jobs.runner import REMAP
 from deepsimbad.jobs.versions import EXPERIENCE, TRAVERSE_ROLES, ExperienceConfig, keep_true_positions
@@ -184,7 +184,7 @@ async def post_remap(
             return JobAnswer.model_validate(before)
         record = running.catalog.domain(domain)
         if config.camera_of is not None:
-            running.catalog.domain(config.camera_of)
+            camera_domain(running.catalog, config.camera_of, record)
         n_frames: dict[str, int] = {}
         for name in (getattr(config, role) for role in TRAVERSE_ROLES):
             if name is not None:

@@ -342,6 +342,24 @@ def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]
     return np.where(inside, position_m, route.wrapped(position_m))
 
 
+def camera_domain(catalog: Catalog, camera_of: str, domain: DomainRecord) -> DomainRecord:
+    """The other domain that a camera is told to be of.
+
+    Raises:
+        UnknownDomainError: There is none such.
+        InvalidMapConfigError: It is the domain itself, or has another evaluator.
+    """
+    other = catalog.domain(camera_of)
+    if other.name == domain.name:
+        raise InvalidMapConfigError(f"camera_of names domain {camera_of} itself: name one of another route")
+    if other.evaluator != domain.evaluator:
+        raise InvalidMapConfigError(
+            f"domain {camera_of} has another evaluator than {domain.name}: what it learnt says nothing here",
+            evaluator=other.evaluator,
+        )
+    return other
+
+
 def seen_twice(catalog: Catalog, camera_of: str, domain: DomainRecord, training: Drive) -> tuple[SeenTwice, ...]:
     """What the camera of another domain saw twice there, for a map whose own route it saw in one season.
 
@@ -353,17 +371,10 @@ def seen_twice(catalog: Catalog, camera_of: str, domain: DomainRecord, training:
 
     Raises:
         UnknownDomainError, NoActiveMapError: There is no such domain or map.
-        InvalidMapConfigError: It has another evaluator, learnt from no second season, or a drive of it is gone.
+        InvalidMapConfigError: It cannot serve (`camera_domain`), learnt from no second season, or a drive is gone.
         InvalidEncodingError, WeightsDifferError: Its encodings are others.
     """
-    other = catalog.domain(camera_of)
-    if other.name == domain.name:
-        raise InvalidMapConfigError(f"camera_of names domain {camera_of} itself: name one of another route")
-    if other.evaluator != domain.evaluator:
-        raise InvalidMapConfigError(
-            f"domain {camera_of} has another evaluator than {domain.name}: what it learnt says nothing here",
-            evaluator=other.evaluator,
-        )
+    other = camera_domain(catalog, camera_of, domain)
     if other.active_version is None:
         raise NoActiveMapError(f"domain {camera_of}, which camera_of names, has no active map", domain=camera_of)
     active = catalog.map(camera_of, other.active_version)
