@@ -90,13 +90,15 @@ def test_every_page_is_whole_and_accessible(open_page, pages, scheme):
         ("domains/none", "Choose one under Domains"),
         ("domains/none/upload", "Choose one under Domains"),
         ("sessions/none", "Open one under Sessions"),
+        ("sessions/" + 64 * "0", "Open one under Sessions"),
         ("jobs/none", "Choose one under Jobs"),
     ],
 )
 def test_what_is_not_there_is_said_once_and_what_to_do(open_page, where, advice):
-    page = open_page(where, expected="404")
+    page = open_page(where, expected="404", viewport=PHONE)
     page.get_by_role("alert").get_by_text(advice).wait_for()
     assert page.get_by_role("alert").count() == 1
+    assert page.get_by_role("alert").evaluate("(alert) => alert.scrollWidth <= alert.clientWidth")
 
 
 REACHABLE = """[...document.querySelectorAll("a[href], button, input, select, summary, iframe, [tabindex='0']")]
@@ -137,6 +139,35 @@ def test_bars_move_only_where_motion_is_not_reduced(open_page, session, motion, 
         .filter((look) => look.animationName !== "none" || look.transitionDuration !== "0s")
         .map((look) => look.transitionDuration)"""
     assert set(page.evaluate(moving)) == ({takes} - {"0s"})
+
+
+ON_A_LOOP = """import("./console/charts.js").then(({ Route }) => {
+    const loop = { route_position_m: [5, 9, 12], x_m: [0, 4, 2], y_m: [0, 0, 2], closed: true, length_m: 10 };
+    const route = new Route(loop);
+    return [route.moved(12, 2), route.moved(12, 4), route.at(15)];
+})"""
+
+
+def test_a_loop_ends_where_it_began(open_page):
+    assert open_page().evaluate(ON_A_LOOP) == [14, 6, {"x": 0, "y": 0}]
+
+
+def test_a_chart_of_one_view_shows_it_and_its_numbers_fit(open_page, service, drives):
+    with Client(service) as client, client.session("route") as live:
+        drive(client, live, drives["winter"], range(5, 6))
+        page = open_page(f"sessions/{live.session_id}")
+        page.get_by_text("After 1 view", exact=True).wait_for()
+        written = """(plot) => {
+            const letters = document.createElement("canvas").getContext("2d");
+            letters.font = "12px system-ui, sans-serif";
+            return parseFloat(plot.style.left) - 15 - letters.measureText("100 %").width;
+        }"""
+        assert page.locator(".u-over").first.evaluate(written) >= 0
+        coloured = """(canvas) => {
+            const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+            return data.some((red, i) => i % 4 === 0 && data[i + 3] === 255 && data[i + 2] - red > 80);
+        }"""
+        assert page.locator(".u-wrap canvas").last.evaluate(coloured)
 
 
 def test_landmarks_are_shown_by_the_frames_they_began_as(open_page):
@@ -261,6 +292,7 @@ def test_a_folder_is_uploaded_mapped_and_rolled_back(open_page, service, drives)
     page.get_by_label("Drive that becomes the map").select_option("winter")
     page.get_by_role("button", name="Remap").click()
     page.get_by_text("Map version 2 answers now.").wait_for()
+    page.get_by_text("It learnt nothing of a second season: without x, y").wait_for()
     page.reload()  # its log is the job's, whenever somebody looks
     page.get_by_text("Map version 2 answers now.").wait_for()
     log = [line.split("\n")[0].lower() for line in page.locator(".log li").all_inner_texts()]

@@ -56,7 +56,7 @@ function sized(canvas) {
 
 // A route for drawing: points to scale where x and y are known, else along a line.
 export class Route {
-  constructor({ route_position_m: at_m, x_m, y_m, chance, closed }) {
+  constructor({ route_position_m: at_m, x_m, y_m, chance, closed, length_m }) {
     this.isPlane = Boolean(x_m && y_m && x_m.some((x) => x !== null));
     const step = Math.max(1, Math.ceil(at_m.length / MOST_POINTS));
     this.points = [];
@@ -69,6 +69,10 @@ export class Route {
     this.closed = Boolean(closed);
     this.start_m = at_m[0];
     this.end_m = at_m[at_m.length - 1];
+    if (this.closed && this.points.length && this.start_m + length_m > this.end_m) { // a loop ends where it began
+      this.end_m = this.start_m + length_m;
+      this.points.push({ ...this.points[0], at_m: this.end_m, ...(this.isPlane ? {} : { x: this.end_m }) });
+    }
     const [xs, ys] = ["x", "y"].map((axis) => this.points.map((point) => point[axis]));
     this.box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
   }
@@ -130,8 +134,11 @@ function drawRoute(canvas, route, isCovered) {
   context.textAlign = "center";
   context.textBaseline = "middle";
   const last = route.points.length - 1;
-  for (const [name, end, inner] of [["start", 0, Math.min(8, last)], ["end", last, Math.max(0, last - 8)]]) {
-    const [[x, y], [towards_x, towards_y]] = [place(route.points[end]), place(route.points[inner])];
+  const [left, bottom, right, top] = route.box;
+  const middle = { x: (left + right) / 2, y: (bottom + top) / 2 };
+  const ends = [["start", 0, route.points[Math.min(8, last)]], ["end", last, route.points[Math.max(0, last - 8)]]];
+  for (const [name, end, inner] of route.closed && route.isPlane ? [["start", 0, middle]] : ends) {
+    const [[x, y], [towards_x, towards_y]] = [place(route.points[end]), place(inner)];
     const away = Math.hypot(x - towards_x, y - towards_y) || 1; // names stand beyond the ends
     context.fillText(name, x + (24 * (x - towards_x)) / away, y + (16 * (y - towards_y)) / away);
   }
@@ -224,12 +231,12 @@ export function Plot({ series, values, label, axes = [{}, {}], scales = { x: { t
     if (chart.current && theme.current !== look) chart.current = chart.current.destroy();
     if (!chart.current) {
       theme.current = look;
-      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: LETTERS, labelFont: LETTERS, size: 44 };
+      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: LETTERS, labelFont: LETTERS, size: 56 };
       chart.current = new globalThis.uPlot({
         width, height, scales, bands, hooks, padding: PADDING,
         cursor: { y: false, drag: { x: false, y: false } },
         axes: axes.map((own, i) => ({ ...axis, ...(i ? {} : { size: 34 }), ...own })),
-        series: [{}, ...series.map((own) => ({ width: 2, points: { show: false }, ...own, stroke: colour(own.stroke), fill: own.fill ? `${colour(own.fill)}55` : undefined }))],
+        series: [{}, ...series.map((own) => ({ width: 2, points: { show: (plot) => plot.data[0].length === 1 }, ...own, stroke: colour(own.stroke), fill: own.fill ? `${colour(own.fill)}55` : undefined }))],
       }, values, ref.current);
     } else {
       if (chart.current.width !== width) chart.current.setSize({ width, height });

@@ -60,7 +60,7 @@ function Card({ domain }) {
 export function useRoute(name, version) {
   const domain = useAnswer(`v1/domains/${name}`);
   const coverage = useAnswer(domain.answer?.map_version ? `v1/domains/${name}/coverage${version ? `?map_version=${version}` : ""}` : null);
-  const route = useMemo(() => coverage.answer && new Route({ ...coverage.answer, closed: domain.answer?.closed }), [coverage.answer]);
+  const route = useMemo(() => coverage.answer && new Route({ ...coverage.answer, closed: domain.answer?.closed, length_m: domain.answer?.route_length_m }), [coverage.answer]);
   return { domain, coverage, route };
 }
 
@@ -74,7 +74,7 @@ export function Domain({ names: [name] }) {
   }, [active]);
   if (domain.problem?.status === 404) return html`<div class="head"><h1>${name}</h1></div><${Fault} problem=${domain.problem} />`;
   return html`<div class="head"><h1>${name}</h1>
-      ${answer && html`<span class="quiet">${answer.evaluator.extractor ?? answer.evaluator.kind}${answer.relevance ? `, ${answer.relevance}` : ""}${answer.closed ? ", closed route" : ""}</span>`}
+      ${answer && html`<span class="quiet">${answer.evaluator.extractor === "none" ? "ready encodings" : (answer.evaluator.extractor ?? answer.evaluator.kind)}${answer.relevance ? `, ${answer.relevance}` : ""}${answer.closed ? ", closed route" : ""}</span>`}
       <span class="row">${answer?.map_version && html`<a class="button" href=${`#try/${name}`}>Try an image</a>`}<a class="button" href=${`#domains/${name}/upload`}>Upload a traverse</a></span></div>
     <${Fault} problem=${domain.problem} /><${Fault} problem=${coverage.problem} />
     ${answer?.map_version === null && html`<div class="card empty"><h2>No map yet</h2><p>Upload a traverse, then remap: the map made of it is activated when it is whole.</p></div>`}
@@ -137,9 +137,10 @@ function Landmarks({ name, version, list_length }) {
   const order = useMemo(() => answer && answer.n_map_images.map((_, number) => number).sort((a, b) => answer.n_map_images[b] - answer.n_map_images[a]), [answer]);
   if (!answer) return html`<${Fault} problem=${problem} />`;
   const isKnown = answer.frame.some((frame) => frame !== null) || answer.map_image.some((image) => image !== null);
+  const origin = isKnown ? "Each began as a frame of a drive." : answer.drive.some((drive) => drive !== null) ? "Each began as a frame that has no name." : "Which frames they began as is not known of this map: a new one will tell.";
   const n = order.length;
   return html`<section class="card below"><header><h2>Landmarks</h2><span class="quiet">${n.toLocaleString()}, most listed first</span></header>
-    <p class="quiet">What views are compared with: every place of the route lists the ${list_length} that together are most like it. ${isKnown ? "Each began as a frame of a drive." : "Which frames they began as is not known of this map: a new one will tell."}</p>
+    <p class="quiet">What views are compared with: every place of the route lists the ${list_length} that together are most like it. ${origin}</p>
     <ol class="places">${order.slice(0, n_shown).map((number) => html`<li key=${number}>
       ${isKnown && html`<${Thumbnail} domain=${name} version=${version} kind="landmarks" number=${number} alt="" isKept=${answer.thumbnail_bytes > 0} />`}
       <div><b>Landmark ${number}</b><small class="number">listed by ${answer.n_map_images[number].toLocaleString()} place${answer.n_map_images[number] === 1 ? "" : "s"}</small>
