@@ -147,16 +147,15 @@ class ApiError(DeepSimbadClientError):
         return f"{self.message} ({self.status} {self.code}{request}){advice}"
 
 
-_KEY_ADVICE = (
-    "`deepsimbad keys create --scope {}` makes one where the service runs; give it in $DEEPSIMBAD_API_KEY or --api-key"
-)
+_GIVE = "give it in $DEEPSIMBAD_API_KEY or --api-key"
+_MAKE = "`deepsimbad keys create --scope {needed}` makes one where the service runs; " + _GIVE
 
 
-class UnauthorizedError(ApiError, status=401, code="unauthorized", advice=_KEY_ADVICE.format("localize|admin")):
+class UnauthorizedError(ApiError, status=401, code="unauthorized", advice=_GIVE):
     """401: no key, or one the service does not know."""
 
 
-class ForbiddenError(ApiError, status=403, code="forbidden", advice=_KEY_ADVICE.format("{needed}")):
+class ForbiddenError(ApiError, status=403, code="forbidden", advice=_MAKE):
     """403: the key lacks the scope this call needs."""
 
 

@@ -47,6 +47,7 @@ def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
     table = deepsimbad("info", "route", "--data-dir", tmp_path / "here")
     assert table.code == 0
     assert "n_map_images" in table.out
+    assert re.search(r"index_bits_per_map_image +[0-9.]{2,8} *\n", table.out)
     sliced = sources(drives, part="#10:40:2")
     ran = deepsimbad("map", "route", *sliced, *READY, "--json", "--data-dir", tmp_path / "here")
     assert (ran.code, ran.err) == (0, "")

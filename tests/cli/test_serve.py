@@ -59,7 +59,11 @@ def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, 
         (("--port", 0), "invalid_settings", "there is no data directory deepsimbad-data"),
         (("--host", "0.0.0.0", "--port", 0), "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN"),
         (("--config", "bad.toml"), "invalid_settings", "there is no setting 'data_dri'"),
-        (("--create", "--data-dir", "here", "--port", "taken"), "unavailable", "cannot listen on"),
+        (
+            ("--create", "--data-dir", "here", "--port", "taken"),
+            "unavailable",
+            "address already in use; --host and",
+        ),
     ],
 )
 def test_a_start_that_fails_is_told_in_one_record_and_one_line(deepsimbad, tmp_path, arguments, code, why):

@@ -131,7 +131,10 @@ def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client
     client.upload(domain, "again", ready_encodings() + 0.1 * noise(1), 2.0 * np.arange(N_READY))
     client.upload(domain, "noise", noise(2), 2.0 * np.arange(N_READY))
     asked = {"training_traverse": "drive", "landmark_traverse": "again", "training_episodes": 0}
-    unsaid, same = (client.remap(domain, **asked, **said)["result"]["metrics"]["second_season"] for said in ({}, SAME))
+    told = [client.remap(domain, **asked, **said)["result"]["metrics"] for said in ({}, SAME)]
+    unsaid, same = (metrics["second_season"] for metrics in told)
+    assert [len(metrics["warnings"]) for metrics in told] == [0, 1]
+    assert "look nearly the same" in told[1]["warnings"][0]
     assert (unsaid["accepted"], same["accepted"]) == (False, True)
     assert "say same_route" in unsaid["why"]
     assert (same["why"], same["n_pairs"]) == (None, N_READY)

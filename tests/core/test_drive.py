@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, Drive, judge
+from deepsimbad.core.drive import (
+    LEAST_CORRELATION,
+    LEAST_PLACES,
+    LIKE_ONE_DAY,
+    ONE_RECORDING,
+    SIGNIFICANCE,
+    Drive,
+    judge,
+)
 from deepsimbad.core.route import Route, same_places
 
 R = 40
@@ -142,6 +150,17 @@ def test_thirty_places_are_the_least(n, accepted):
     place = rng.normal(size=(90, 12))
     found = verdict(rng, place, place, diagonal(n), noise=0.1)
     assert (found.accepted, found.n_pairs) == (accepted, n)
+
+
+def test_recordings_of_one_day_are_no_two_seasons():
+    rng = np.random.default_rng(19)
+    place = rng.normal(size=(120, 12))
+    copy, alike, other = (verdict(rng, place, place, noise=noise) for noise in (0.01, 0.1, 0.5))
+    assert copy.correlation > ONE_RECORDING > alike.correlation > LIKE_ONE_DAY > other.correlation
+    assert (copy.accepted, "copies of one recording" in copy.why) == (False, True)
+    assert (alike.accepted, other.accepted) == (True, True)
+    assert "look nearly the same (mean correlation 0.9" in alike.remarks()[0]
+    assert copy.remarks() == other.remarks() == ()
 
 
 def test_what_agrees_a_little_is_not_worth_learning_from():

@@ -6,6 +6,7 @@ import shlex
 import tomllib
 from functools import cache
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -105,6 +106,20 @@ def test_every_command_named_exists_and_has_the_options_shown(pages):
                 assert re.search(rf"{option}\b", shown), f"{page.path.name}: {text}: no option {option}"
                 n_options += 1
     assert n_options > 20
+
+
+def told(command):
+    """Every option of a command and of those below it, with what its help says; and what lists say of the command."""
+    for below in getattr(command, "list_commands", lambda _: ())(click.Context(command)):
+        yield from told(command.get_command(click.Context(command), below))
+    yield command.name, command.get_short_help_str(200)
+    yield from ((f"{command.name} {it.opts[0]}", it.help) for it in command.params if isinstance(it, click.Option))
+
+
+def test_every_option_says_what_it_is_for():
+    for about, text in (*told(deepsimbad), *told(deepsimbad_client)):
+        assert text, f"{about} says nothing"
+        assert not re.search(r"\b[A-Z][a-z]{1,2}\.$", text), f"{about} is cut off behind an abbreviation: {text}"
 
 
 def test_every_module_extra_link_and_file_named_is_there(pages):

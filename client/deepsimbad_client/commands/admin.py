@@ -226,7 +226,7 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
     help="composed, standardised, rrf, bag_of_landmarks, simbad or brute_force; absent: the service's default.",
 )
 @click.option("--training-episodes", type=click.IntRange(min=0), help="Length of the training of the planner `nnql`.")
-@click.option("--seed", type=int)
+@click.option("--seed", type=int, help="Equal seeds, equal maps.  [default: 0]")
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")
 @click.option(
     *("--check", "--check-traverse", "check_traverse"),

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import timedelta
@@ -30,10 +29,10 @@ from deepsimbad_client.http.upload import CONCURRENCY, UploadReport
 from deepsimbad_client.http.wire import DEFAULT_URL, KEY_VARIABLE, URL_VARIABLE
 from deepsimbad_client.replay.active import Episode
 from deepsimbad_client.replay.passive import Step
+from deepsimbad_client.tables import print_whole
 
 REMARKS = Console(stderr=True, highlight=False, markup=False)
 """Progress and remarks; names may hold brackets, so nothing is read as markup."""
-PIPE_COLUMNS = 160
 _GAPS_SHOWN = 8
 
 Command = Callable[..., None]
@@ -43,7 +42,13 @@ def serving(command: Command) -> Command:
     """Options of every command that talks to a service, and the `client` made of them."""
 
     @click.option(
-        "--server", envvar=URL_VARIABLE, default=DEFAULT_URL, show_default=True, show_envvar=True, metavar="URL"
+        "--server",
+        envvar=URL_VARIABLE,
+        default=DEFAULT_URL,
+        show_default=True,
+        show_envvar=True,
+        metavar="URL",
+        help="Address of the service.",
     )
     @click.option(
         "--api-key", envvar=KEY_VARIABLE, help=f"Better kept in ${KEY_VARIABLE}: a command line can be read by others."
@@ -64,16 +69,13 @@ at_once = click.option(
     help="Requests under way at once.",
 )
 json_flag = click.option("--json", "json_output", is_flag=True, help="Print one JSON document.")
-domain_option = click.option("--domain", required=True, metavar="NAME")
+domain_option = click.option("--domain", required=True, metavar="NAME", help="Of the route.")
 of_domain = click.option("--domain", metavar="NAME", help="Only this domain's.")
 
 
 def show(table: Table) -> None:
-    """Print a result on standard output; in a pipe or a file names and numbers stay whole."""
-    console = Console(highlight=False, markup=False)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = PIPE_COLUMNS
-    console.print(table)
+    """Print a result on standard output."""
+    print_whole(table, Console(highlight=False, markup=False))
 
 
 class Remarks(logging.Handler):
@@ -113,7 +115,7 @@ class Bar(Progress):
             left or TimeRemainingColumn(),
             TextColumn("{task.fields[note]}", markup=False),
             console=REMARKS,
-            disable=not REMARKS.is_terminal,
+            disable=not REMARKS.is_interactive,
         )
         self._bar = self.add_task(label, total=total, note="", left="")
 

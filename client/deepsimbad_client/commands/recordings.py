@@ -111,7 +111,7 @@ def upload(
 @click.command()
 @click.argument("words", nargs=-1, required=True, metavar="DOMAIN IMAGE...")
 @click.option("--domain", metavar="NAME", help="In place of the first word.")
-@click.option("--shortlist", type=click.IntRange(min=1), default=10, show_default=True)
+@click.option("--shortlist", type=click.IntRange(min=1), default=10, show_default=True, help="Places told of each.")
 @rotate_option
 @json_flag
 @serving
@@ -198,7 +198,7 @@ def _make_domain(
 @click.option("--steps", type=click.IntRange(min=1), help=f"Moves in an episode.  [default: {STEPS}]")
 @click.option("--seed", type=click.IntRange(min=0), help="Of the starts and the sessions.  [default: 0]")
 @click.option("--restart", is_flag=True, help="Throw away what an earlier replay left in the folder.")
-@click.option("--plots/--no-plots", default=True, show_default=True)
+@click.option("--plots/--no-plots", default=True, show_default=True, help="Draw pictures of it.")
 @click.option("--rerun", is_flag=True, help="Show it in the Rerun viewer as it goes.")
 @click.option("--mcap", type=click.Path(dir_okay=False, path_type=Path), help="Write what Foxglove opens.")
 @at_once

@@ -300,8 +300,9 @@ def raise_for_problem(response: httpx2.Response) -> None:
     code = str(problem.get("code") or "")
     detail = problem.get("detail") or problem.get("title")
     request_id = response.headers.get(REQUEST_ID) or problem.get("request_id")
+    answered = f"{response.request.url} answered {status} {response.reason_phrase}".rstrip()
     raise api_error_class(status, code)(
-        str(detail or f"the service answered {status} {response.reason_phrase}".rstrip()),
+        str(detail or f"{answered}, and no reason as this service gives: is the address right?"),
         status=status,
         code=code,
         problem=problem,

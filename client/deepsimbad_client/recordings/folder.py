@@ -31,7 +31,7 @@ from deepsimbad_client.recordings import (
 )
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, TRACK_SUFFIXES, read_exif, read_track, utm, zone_remarks
 from deepsimbad_client.recordings.names import in_order, times_of
-from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, lies_on_its_side
+from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, drives_in, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions
 from deepsimbad_client.recordings.told import CAPTIONS
@@ -140,7 +140,7 @@ def _hint(folder: Path, others: Sequence[str]) -> str:
         return f"; for NCLT write nclt:{folder}"
     if others:
         return f"; {others[0]} is of a format that is not read: convert it to PNG"
-    return next((f"; {path} does" for path in _inner(folder)), "")
+    return next((f"; {path} does" for path in _inner(folder)), drives_in(folder))
 
 
 def _inner(folder: Path) -> list[Path]:

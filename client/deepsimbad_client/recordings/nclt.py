@@ -167,7 +167,7 @@ def read_nclt(
         places = [above / date / "lb3" / f"Cam{camera}" for above in (root, root / "images")]
         for above in (root, root / "images"):
             places += sorted((above / date).glob(f"lb3*/Cam{camera}*"))
-        folder = _first(f"images of NCLT {date}", places, Path.is_dir)
+        folder = _first(f"images of NCLT {date}", places, Path.is_dir, drives_in(root / date, root))
     truth = read_ground_truth(_first(f"ground truth of NCLT {date}", ground_truth_files(root, date), Path.is_file))
     names, not_times = _images_by_time(folder)
     if not names:
@@ -202,11 +202,17 @@ def ground_truth_files(root: Path, date: str) -> list[Path]:
     ]
 
 
-def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool]) -> Path:
+def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool], near: str = "") -> Path:
     for place in places:
         if is_there(place):
             return place
-    raise SourceError(f"no {what}: looked for {', '.join(map(str, places))}")
+    raise SourceError(f"no {what}: looked for {', '.join(map(str, places))}{near}")
+
+
+def drives_in(*roots: Path) -> str:
+    """What to say of the drives that lie in the first of some folders to hold any."""
+    found = [sorted(f"nclt:{images.parent}" for images in root.glob("*/lb3")) for root in roots]
+    return next((f"; there is {', '.join(drives)}" for drives in found if drives), "")
 
 
 def _images_by_time(folder: Path) -> tuple[dict[int, str], list[str]]:

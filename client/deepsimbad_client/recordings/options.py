@@ -88,7 +88,7 @@ def opened(source: str, allow_missing: bool = True, *, closed: bool = False, **r
     Raises SourceError, TooManyLeftOutError, click.UsageError (an option does not go with the recording).
     """
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bars:
+    with Progress(console=console, transient=True, disable=not console.is_interactive) as bars:
         task = bars.add_task(f"open {source}", total=1.0)
         try:
             recording = open_source(source, on_progress=lambda share: bars.update(task, completed=share), **reading)

@@ -102,8 +102,8 @@ def _show(state: SessionState, console: Console, live: Live | None) -> None:
 
 @contextmanager
 def _live(console: Console) -> Iterator[Live | None]:
-    """A moving picture where there is a terminal; its last state stays."""
-    if not console.is_terminal:
+    """A moving picture where there is a terminal that can show it; its last state stays."""
+    if not console.is_interactive:
         yield None
         return
     with Live(console=console, auto_refresh=False) as live:

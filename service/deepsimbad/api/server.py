@@ -175,6 +175,14 @@ def http_config(app: Callable[..., Any], settings: Settings) -> uvicorn.Config:
     return config
 
 
+def cannot_listen(settings: Settings, why: OSError) -> UnavailableError:
+    """What to raise where the address is taken, or is none of this machine's."""
+    reason = (why.strerror or str(why)).rpartition("): ")[2]  # asyncio repeats the address
+    return UnavailableError(
+        f"cannot listen on {settings.host}:{settings.port}: {reason}; --host and --port name another address"
+    )
+
+
 def serve(settings: Settings, create: bool = False) -> None:
     """Serve until a signal ends it; requests under way are finished first.
 
@@ -218,6 +226,6 @@ def serve(settings: Settings, create: bool = False) -> None:
     except SystemExit as ended:  # how uvicorn says that it could not start
         why = ended.__context__
         if isinstance(why, OSError):
-            raise UnavailableError(f"cannot listen on {settings.host}:{settings.port}: {why.strerror or why}") from why
+            raise cannot_listen(settings, why) from why
         unforeseen = UnavailableError("the service could not start: the log says why")
         raise getattr(app.state, "startup_error", unforeseen) from ended

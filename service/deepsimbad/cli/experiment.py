@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from deepsimbad.cli.local import list_length_option, seed_option, training_episodes_option
 from deepsimbad.cli.terminal import (
     RELEVANCES,
     Command,
@@ -41,7 +42,6 @@ from deepsimbad.jobs.experiments.truth import known_drives, read_ground_truth
 from deepsimbad.jobs.experiments.vpr import RANKS, VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad.jobs.fitting import Pictures, RecordingPictures
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap_config import DEFAULT_TRAINING_EPISODES
 from deepsimbad_client.recordings import Recording, left_out_lines
 from deepsimbad_client.recordings.sources import open_source
 
@@ -77,7 +77,7 @@ def _triplet_options(command: Command) -> Command:
             type=click.IntRange(min=1),
             help=f"How many landmarks.  [default: {_N_LANDMARKS}, or every frame of a shorter recording]",
         ),
-        click.option("--list-length", type=click.IntRange(min=1), default=4, show_default=True),
+        list_length_option,
         click.option(
             "--same-route/--no-same-route",
             default=None,
@@ -121,7 +121,7 @@ def vpr(
     ground_truth: Path | None,
     **asked: Any,
 ) -> None:
-    """Single-view place recognition (III, Fig. 6): ANR and recall of every relevance.
+    """Single-view place recognition (III, figure 6): ANR and recall of every relevance.
 
     Beside it the drive in order: what composed's belief makes of the last 1 to 20 views, and what sums make of them.
     """
@@ -170,13 +170,13 @@ def vpr(
     type=click.Choice([rule.value for rule in UpdateRule]),
     help="How a view changes the belief.  [default: as suits the relevance]",
 )
-@click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
+@training_episodes_option
 @click.option(
     "--episodes", type=click.IntRange(min=2), help="Test episodes of every planner, drawn.  [default: from every start]"
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, **asked: Any) -> None:
-    """Active self-localization (III, Fig. 7): ANR of every planner over episodes of ten moves.
+    """Active self-localization (III, figure 7): ANR of every planner over episodes of ten moves.
 
     Every planner has the same starts. The paper's set-up (rrf, additive relevance) is measured beside ours.
     """
@@ -198,15 +198,18 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
 @experiment.command()
 @_triplet_options
 @evaluator_option
-@click.option("--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True)
+@click.option(
+    "--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True, help="How views find places."
+)
 @click.option(
     "--filter",
     "filter_name",
     type=click.Choice([kind.value for kind in FilterKind]),
     default=FilterKind.GRID.value,
     show_default=True,
+    help="How beliefs are kept.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **asked: Any) -> None:
     """How far a belief can be trusted: its 95 % sets and its sure answers against the truth.
 
@@ -328,7 +331,7 @@ def _print_relevances(report: VprReport) -> None:
 
 def _print_passive(passive: PassiveScores) -> None:
     """The belief and its rivals a row."""
-    table = Table("in order", *(f"{views} views: ANR / R@1" for views in WINDOWS))
+    table = Table("in order", *(f"{views} view{'s' if views > 1 else ''}: ANR / R@1" for views in WINDOWS))
     for name, scores in passive.by_window.items():
         table.add_row(name, *(f"{score.anr:.2f} / {score.recall_at[1]:.1f}" for score in scores.values()))
     whole = passive.whole
@@ -413,4 +416,6 @@ def _other_robots(document: dict[str, Any]) -> list[str]:
 
 
 def _no_second_season(verdict: SameRoute | None) -> tuple[str, ...]:
-    return () if verdict is None or verdict.why is None else (f"no second season was learnt from: {verdict.why}",)
+    if verdict is None or verdict.why is None:
+        return () if verdict is None else verdict.remarks()
+    return (f"no second season was learnt from: {verdict.why}",)

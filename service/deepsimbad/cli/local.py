@@ -1,5 +1,6 @@
 """`deepsimbad map`, `localize` and `info`: the same data directory as the server's, without a server."""
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, TypeAlias
@@ -76,6 +77,25 @@ def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str 
     return actions_m
 
 
+list_length_option = click.option(
+    "--list-length",
+    type=click.IntRange(min=1),
+    default=DEFAULT_LIST_LENGTH,
+    show_default=True,
+    help="Landmarks a map image keeps.",
+)
+training_episodes_option = click.option(
+    "--training-episodes",
+    type=click.IntRange(min=0),
+    default=DEFAULT_TRAINING_EPISODES,
+    show_default=True,
+    help="Length of the training of the planner `nnql`; 0: none.",
+)
+seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Equal seeds, equal results."
+)
+
+
 @click.command("map")
 @click.argument("domain")
 @click.option("--landmarks", help="SOURCE of another drive, to choose landmarks from and learn from.  [default: none]")
@@ -86,10 +106,12 @@ def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str 
     type=click.IntRange(min=1),
     help=f"How many landmarks.  [default: {DEFAULT_N_LANDMARKS}, or every frame of a shorter recording]",
 )
-@click.option("--list-length", type=click.IntRange(min=1), default=DEFAULT_LIST_LENGTH, show_default=True)
-@click.option("--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True)
-@click.option("--training-episodes", type=click.IntRange(min=0), default=DEFAULT_TRAINING_EPISODES, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@list_length_option
+@click.option(
+    "--relevance", type=RELEVANCES, default=DEFAULT_RELEVANCE.value, show_default=True, help="How views find places."
+)
+@training_episodes_option
+@seed_option
 @click.option(
     "--same-route/--no-same-route",
     default=None,
@@ -302,6 +324,9 @@ def info(domain: str, as_json: bool) -> None:
         write_json(answer.model_dump())
         return
     table = Table.grid(padding=(0, 2))
+    table.add_column()
+    table.add_column(overflow="fold")  # digests are there to be copied
     for name, value in answer.model_dump().items():
-        table.add_row(name, "-" if value is None else str(value))
+        text = f"{value:.6g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
+        table.add_row(name, "-" if value is None else text)
     print_table(table)

@@ -15,8 +15,15 @@ import click
 from rich.table import Table
 
 from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, experiment, json_file_option, kept_in, tell, tolerance_option
+from deepsimbad.cli.local import seed_option, training_episodes_option
 from deepsimbad.cli.paper_page import write_report
-from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar
+from deepsimbad.cli.terminal import (
+    data_dir_option,
+    evaluator_option,
+    given_settings,
+    print_table,
+    progress_bar,
+)
 from deepsimbad.core.composed import MOST_DIMENSIONS
 from deepsimbad.core.drive import Drive
 from deepsimbad.errors import InvalidSourceError
@@ -52,13 +59,17 @@ _MOST_POINTS = 400  # of a trajectory as it is drawn
     "--nclt", "root", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder of drives."
 )
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("paper-output"), show_default=True
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("paper-output"),
+    show_default=True,
+    help="Folder of the page, and of what a second run need not do again.",
 )
 @evaluator_option
-@click.option("--n-landmarks", type=click.IntRange(min=1), default=500, show_default=True)
-@click.option("--training-episodes", type=click.IntRange(min=0), default=10_000, show_default=True)
+@click.option("--n-landmarks", type=click.IntRange(min=1), default=500, show_default=True, help="How many landmarks.")
+@training_episodes_option
 @click.option("--episodes", type=click.IntRange(min=2), default=150, show_default=True, help="Of every planner, drawn.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 @tolerance_option
 @reading
 @json_file_option
@@ -72,7 +83,7 @@ def paper(
     json_file: Path | None,
     **asked: Any,
 ) -> None:
-    """The paper's section III: eight triplets of four drives, Fig. 5 to 7, and what is better.
+    """The paper's section III: eight triplets of four drives, figures 5 to 7, and what is better.
 
     ROOT holds NCLT as downloaded or rendered, or ready encodings DATE.npy, of 2012-01-22, 2012-03-31, 2012-08-04 and
     2012-11-17. What lacks a drive is not run, and said. DIR gets index.html, report.md, figures.csv and paper.json, and

@@ -3,7 +3,6 @@
 import json
 import math
 import signal
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +32,7 @@ from deepsimbad.settings import Settings, TracedSettings, trace_settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
+from deepsimbad_client.tables import print_whole
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -175,7 +175,7 @@ def progress_bars(done: ProgressColumn) -> Bars:
     """Bars on standard error; where that is no terminal, a log keeps an error's one line, and no blank ones."""
     errors = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), done, TimeRemainingColumn())
-    return Bars(*columns, console=errors, transient=True, disable=not errors.is_terminal)
+    return Bars(*columns, console=errors, transient=True, disable=not errors.is_interactive)
 
 
 @contextmanager
@@ -204,11 +204,11 @@ def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -
 
 
 def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
-    """A table on standard output, whole where that is no terminal, and remarks in lines below it."""
+    """A table on standard output, and remarks in lines below it."""
     for column in table.columns[1:] if numbers else ():  # the first holds names
         column.justify = "right"
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    console.print(table)
+    console = Console()
+    print_whole(table, console)
     for remark in remarks:
         console.print(remark)
 

@@ -42,6 +42,11 @@ _ROWS_AT_ONCE, _NAMED = 1024, 3
 SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
 # Mean, of scores at equal positions; where scenery repeats, chance goes far, but rarely this far
 LEAST_CORRELATION = 0.2
+# Recordings of one day teach that what comes will look as the map does. On NetVLAD's Nordland, where one drive alone
+# holds 89 % of single views in their 95 % sets, copies with noise left 39 % (correlation 0.997), 57 % (0.97) and 80 %
+# (0.90); real second drives measured 0.51 to 0.75. Robots may drive under one light for ever: it is told, not refused.
+LIKE_ONE_DAY = 0.9
+ONE_RECORDING = 0.999  # copies of one, which teach nothing
 LEAST_PLACES = 30  # that both saw
 _STATION_M = 1.0  # frames nearer together, as of a robot that stands, say nothing new
 _FEWEST_STATIONS, _MOST_STATIONS = 64, 512  # a short route is cut finer, a long one coarser
@@ -292,6 +297,16 @@ class SameRoute:
         """The JSON form."""
         return asdict(self)
 
+    def remarks(self) -> tuple[str, ...]:
+        """What a person should know of what was learnt."""
+        if not self.accepted or self.correlation is None or self.correlation <= LIKE_ONE_DAY:
+            return ()
+        return (
+            f"the two drives look nearly the same (mean correlation {self.correlation:.3f}), as those of one day do: "
+            "what a season changes is not learnt from them, and in another one beliefs will be too sure; give a drive "
+            "of another day",
+        )
+
 
 def second_season(
     own: Drive, closed: bool, other: Drive, same_route: bool | None, measure: Callable[[Drive], Drive]
@@ -351,6 +366,8 @@ def judge(
             f"at equal positions the two drives agree too little to learn from (mean correlation {correlation:.2f}, "
             f"{LEAST_CORRELATION:g} is asked for)"
         )
+    elif correlation > ONE_RECORDING:
+        why = f"the two drives are copies of one recording (mean correlation {correlation:.5f} at equal positions)"
     return SameRoute(why is None, why, len(places), correlation, statistic, significance)
 
 

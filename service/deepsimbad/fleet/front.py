@@ -22,7 +22,7 @@ from deepsimbad.api.door import FREE_BYTES, most_body_bytes
 from deepsimbad.api.keys import KeyRing, check_reach, presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.requests import Slots
-from deepsimbad.api.server import configure_logging, http_config
+from deepsimbad.api.server import cannot_listen, configure_logging, http_config
 from deepsimbad.errors import DeepSimbadError, ForbiddenError, UnauthorizedError, UnavailableError
 from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
 from deepsimbad.fleet.owners import Administrators
@@ -82,8 +82,7 @@ class Front:
         try:
             listening = socket.create_server((settings.host, settings.port), backlog=2048)
         except OSError as error:
-            where = f"{settings.host}:{settings.port}"
-            raise UnavailableError(f"cannot listen on {where}: {error.strerror or error}") from error
+            raise cannot_listen(settings, error) from error
         self._address: tuple[str, int] = listening.getsockname()[:2]
         server = uvicorn.Server(http_config(self, settings))
         self._serving = asyncio.create_task(server.serve([listening]))

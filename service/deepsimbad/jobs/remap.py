@@ -177,7 +177,7 @@ class _Remap:
             "seconds": seconds,
             **learnt,
             "check": check,
-            "warnings": [*learnt.get("warnings", ()), *self._warnings(inputs)],
+            "warnings": [*learnt["warnings"], *self._warnings(inputs)],
         }
         progress.stage("seal")
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
@@ -336,7 +336,8 @@ class _Remap:
         learnt: dict[str, Any] = {"landmarks": source, "training": learning, "second_season": second_season}
         learnt["camera_of"] = config.camera_of if built.by_camera else None
         if built.fitting is not None:
-            learnt |= {"fitting": dict(built.fitting), "warnings": list(built.warnings)}
+            learnt["fitting"] = dict(built.fitting)
+        learnt["warnings"] = [*built.warnings, *(() if built.same_route is None else built.same_route.remarks())]
         return map_, map_, asked, learnt
 
     def _appended(self, inputs: _Inputs, before: Map, frames: CheckFrames) -> _Draft:
@@ -358,10 +359,11 @@ class _Remap:
             )
         check_alike(before, config)
         fused, verdict = None, {"accepted": False, "why": inputs.known}
+        warnings: tuple[str, ...] = ()
         if isinstance(inputs.known, KnownDrives):
             known, joining = self._in_space(before, inputs.known, drive)
             fused, judged = fuse(before, known, joining, config.same_route)
-            verdict = judged.as_dict()
+            verdict, warnings = judged.as_dict(), judged.remarks()
         if fused is None:
             map_ = append_drive(before, measured(drive, before.landmark_model, self.evaluator, self.progress.update))
         else:
@@ -383,6 +385,7 @@ class _Remap:
             config_after["cameras"] = [camera.as_dict() for camera in (*before.cameras, drive.camera)]
         learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season", "camera_of")}
         learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
+        learnt["warnings"] = warnings
         checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_
         return replace(map_, config=config_after), checked, config_after, learnt
 

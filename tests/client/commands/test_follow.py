@@ -105,7 +105,7 @@ def test_a_job_is_followed_to_its_end(streams, answers, heard):
 @pytest.mark.parametrize(
     ("status", "code", "error", "words"),
     [
-        (401, "unauthorized", errors.UnauthorizedError, "keys create"),  # the key was revoked meanwhile
+        (401, "unauthorized", errors.UnauthorizedError, "API_KEY"),  # the key was revoked meanwhile
         (403, "forbidden", errors.ForbiddenError, "keys create"),
         (404, "unknown_job", errors.UnknownJobError, "no job 7"),
     ],

@@ -20,7 +20,7 @@ def test_a_refused_key_is_told_in_one_line_and_what_to_do(tmp_path, monkeypatch,
             assert run(["jobs"]) == 1
             refused = capsys.readouterr().err
             assert refused.startswith(f"deepsimbad-client: {code}: ")
-            assert "deepsimbad keys create --scope" in refused
+            assert "`deepsimbad keys create" in refused
             assert "$DEEPSIMBAD_API_KEY" in refused
             assert refused.count("\n") == 1
             assert robot not in refused

@@ -1,3 +1,5 @@
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -332,6 +334,11 @@ def test_images_of_a_format_that_is_not_read_are_left_out_by_name(folder):
     (folder / "inner" / "1.png").write_bytes(b"")
     with pytest.raises(SourceError, match=r"holds no images.*; \S*inner does"):
         open_source(str(folder))
+    shutil.rmtree(folder / "inner")
+    (folder / "2012-01-22" / "lb3").mkdir(parents=True)
+    for source in (str(folder), f"nclt:{folder}", f"nclt:{folder}/2012-01-23"):  # above the drives, or beside them
+        with pytest.raises(SourceError, match=rf"; there is nclt:{folder}/2012-01-22$"):
+            open_source(source)
 
 
 def test_what_spreadsheets_write_is_read_or_how_to_save_it_is_said(folder):

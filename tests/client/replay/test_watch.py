@@ -24,8 +24,10 @@ def stage(client, encodings):
     return Stage(client, open_source(str(encodings / "winter.npy")), "route")
 
 
-def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage):
-    shown, written = console(terminal=False)
+@pytest.mark.parametrize("kind", [None, "dumb"])
+def test_where_no_picture_can_move_an_episode_is_a_line_for_each_view(stage, monkeypatch, kind):
+    monkeypatch.setenv("TERM", kind or "xterm")
+    shown, written = console(terminal=kind is not None)
     slept: list[float] = []
     steps = watch_episode(stage, shown, planner="constant:7", steps=4, seed=2, pause_s=0.5, sleep=slept.append)
     lines = written.getvalue().splitlines()
@@ -36,7 +38,8 @@ def test_an_episode_off_a_terminal_is_a_line_for_each_view(stage):
     assert slept == [0.5] * 4
 
 
-def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage):
+def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
     shown, written = console(terminal=True)
     steps = watch_episode(stage, shown, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
     figures = ("asks for", "m (informed)", "lost", "confident", "may stop", f"{steps[-1].true_route_m:.1f} m")

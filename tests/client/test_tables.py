@@ -1,0 +1,29 @@
+"""Tables on terminals of any width."""
+
+import io
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from deepsimbad_client.tables import print_whole
+
+NAMES = ("job", "state", "outcome")
+ROWS = (("0123456789abcdef" * 2, "succeeded", "map 1, sealed"), ("f" * 32, "failed", "too few candidates"))
+
+
+@pytest.mark.parametrize(("columns", "is_terminal"), [(140, True), (60, True), (20, True), (60, False)])
+def test_nothing_is_cut(monkeypatch, columns, is_terminal):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    table = Table(*NAMES, title="jobs")
+    for row in ROWS:
+        table.add_row(*row)
+    written = io.StringIO()
+    print_whole(table, Console(file=written, width=columns, force_terminal=is_terminal, color_system=None))
+    shown = written.getvalue()
+    assert "…" not in shown
+    together = "".join(shown.split())
+    assert all("".join(text.split()) in together for text in (*NAMES, *sum(ROWS, ())))
+    is_down = is_terminal and columns < 140
+    assert ("│" in shown) == (not is_down)
+    assert not is_terminal or max(map(len, shown.splitlines())) <= columns
