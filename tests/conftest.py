@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
@@ -74,12 +75,19 @@ def rendered(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled(tmp_path_factory) -> None:
-    """In a new checkout the first test process compiles the kernels for all, 20 seconds that each would spend."""
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - a second that a single file may do without
+    """In a new checkout the first test process compiles the kernels for all, half a minute that each would spend."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    with one_at_a_time(tmp_path_factory, "kernels") as shared:
+        if not (folder := shared / "kernels").exists():
+            from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - seconds that a single file may do without
 
-        with one_at_a_time(tmp_path_factory, "kernels"):
+            from .commands import ran  # noqa: PLC0415
+
+            folder.mkdir()
+            np.save(folder / "drive.npy", np.random.default_rng(0).normal(size=(60, 8)).astype(np.float32))
             warm_up()
+            ran("deepsimbad map drive --landmarks drive.npy --training drive.npy --evaluator feature_l2:none", folder)
 
 
 @pytest.fixture(scope="session", autouse=True)

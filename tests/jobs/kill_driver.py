@@ -35,7 +35,7 @@ DOMAIN, SESSION = "route", "s" * 32
 READY = {"kind": "feature_l2", "extractor": "none"}
 N_FRAMES = 50
 CONFIGS = {
-    "remap": RemapConfig("drive", "other", n_landmarks=8, training_episodes=60),
+    "remap": RemapConfig("drive", "other", n_landmarks=8, training_episodes=6),
     "experience": ExperienceConfig.of(SESSION, np.arange(0, 20, 2.0).tolist()),
 }
 WITHIN_S = 60
