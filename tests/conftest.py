@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -56,38 +57,47 @@ def real_data() -> Path:
 
 
 @contextmanager
-def one_at_a_time(tmp_path_factory, name: str) -> Iterator[Path]:
-    """The folder of all test processes; the others of the same name wait."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+def one_at_a_time(shared: Path, name: str) -> Iterator[None]:
+    """Others that share the folder wait with what is called the same."""
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        yield shared
+        yield
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory) -> Path:
+def shared(tmp_path_factory) -> Path:
+    """The folder of all test processes."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def rendered(shared) -> Path:
     """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed."""
-    with one_at_a_time(tmp_path_factory, "campus") as shared:
+    with one_at_a_time(shared, "campus"):
         write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
     return shared / "campus"
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _compiled(tmp_path_factory) -> None:
+@cache
+def _compile(shared: Path) -> None:
     """In a new checkout the first test process compiles the kernels for all, half a minute that each would spend."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        return
-    with one_at_a_time(tmp_path_factory, "kernels") as shared:
+    from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - seconds that a single file may do without
+
+    from .commands import ran  # noqa: PLC0415
+
+    with one_at_a_time(shared, "kernels"):
         if not (folder := shared / "kernels").exists():
-            from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - seconds that a single file may do without
-
-            from .commands import ran  # noqa: PLC0415
-
             folder.mkdir()
             np.save(folder / "drive.npy", np.random.default_rng(0).normal(size=(60, 8)).astype(np.float32))
             warm_up()
             ran("deepsimbad map drive --landmarks drive.npy --training drive.npy --evaluator feature_l2:none", folder)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Before all that a test asks for; what is packaged brings its own kernels, and need not wait for these."""
+    if "PYTEST_XDIST_WORKER" in os.environ and item.path.parent.name != "packaging":
+        _compile(Path(item.config.option.basetemp).parent)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -118,6 +128,9 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first, so that no process is left alone with one at the end."""
+    """Files with slow tests come first, so that no process is left alone with one at the end.
+
+    What is packaged begins: it has something to do while another process compiles the kernels.
+    """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path not in slow, item.path.parent.name != "packaging"))

@@ -1,6 +1,7 @@
 """A service that has too much to do says so at once, and still says how it is."""
 
 import threading
+from contextlib import contextmanager
 
 import pytest
 from anyio.to_thread import current_default_thread_limiter, run_sync
@@ -26,13 +27,23 @@ def is_healthy(client):
     return {client.get(path).status_code for path in ("/healthz", "/readyz", "/metrics")} == {200}
 
 
-def test_a_full_queue(busy):
-    path = busy.session()
+@contextmanager
+def full_queue(busy):
+    """One task is done all the while and another waits, as many as may; afterwards both are done."""
     worker, gate, begun = busy.services.worker, threading.Event(), threading.Event()
     worker.submit(lambda: (begun.set(), gate.wait(60)))
     assert begun.wait(60)
     waiting = worker.submit(lambda: None)
     try:
+        yield
+    finally:
+        gate.set()
+    waiting.result(60)
+
+
+def test_a_full_queue(busy):
+    path = busy.session()
+    with full_queue(busy):
         overloaded(busy.post("/v1/localizations?domains=ready", json=RANKS), "max_queue")
         overloaded(busy.post("/v1/domains/ready/sessions", json={}), "max_queue")
         assert busy.post(READY, json=RANKS).status_code == 200  # what is short waits for nobody
@@ -40,9 +51,6 @@ def test_a_full_queue(busy):
         assert busy.post(f"{path}/observations", json=RANKS).status_code == 200
         assert is_healthy(busy)
         assert 'deepsimbad_refused_requests_total{reason="max_queue"} 2.0' in busy.get("/metrics").text
-    finally:
-        gate.set()
-    waiting.result(60)
     assert busy.get(path).json()["n_observations"] == 1
 
 
@@ -50,16 +58,9 @@ def test_long_views_wait_in_the_queue(busy, monkeypatch):
     """A map too large to be answered between two requests is answered by the worker, in turn."""
     monkeypatch.setattr("deepsimbad.engine.localizer._MOST_IMAGES", 0)
     path = busy.session()
-    worker, gate, begun = busy.services.worker, threading.Event(), threading.Event()
-    worker.submit(lambda: (begun.set(), gate.wait(60)))
-    assert begun.wait(60)
-    waiting = worker.submit(lambda: None)
-    try:
+    with full_queue(busy):
         overloaded(busy.post(READY, json=RANKS), "max_queue")
         overloaded(busy.post(f"{path}/observations", json=RANKS), "max_queue")
-    finally:
-        gate.set()
-    waiting.result(60)
     assert busy.post(f"{path}/observations", json=RANKS).json()["n_observations"] == 1
 
 

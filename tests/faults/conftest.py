@@ -178,9 +178,9 @@ REMAP = {
 
 
 @pytest.fixture(scope="session")
-def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def furnished(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data directory with two mapped domains, `loop` with two versions: for all test processes, never touched."""
-    with one_at_a_time(tmp_path_factory, "furnished") as shared:
+    with one_at_a_time(shared, "furnished"):
         if not (data_dir := shared / "furnished").is_dir():
             furnish(making := tmp_path_factory.mktemp("furnished") / "data")
             making.rename(data_dir)

@@ -79,6 +79,17 @@ def add_map(make_map: MakeMap) -> Callable[..., MapRecord]:
     return add
 
 
+@pytest.fixture
+def pair(node: MakeNode, add_map: Callable[..., MapRecord]) -> tuple[SharedCatalog, SharedCatalog]:
+    """Two nodes; the first has made a map that serves, and the second has heard of it."""
+    here, there = node("here"), node("there")
+    make_domain(here)
+    add_map(here)
+    here.activate("campus", 1, None)
+    there.follow()
+    return here, there
+
+
 def make_domain(catalog: Catalog, name: str = "campus", **changes: Any) -> None:
     catalog.create_domain(name, **{"evaluator": EVALUATOR, "closed": False, "actions_m": [1.0, 2.0], **changes})
 
@@ -346,13 +357,10 @@ def test_a_change_that_cannot_be_published_is_not_made(
 
 
 def test_a_damaged_object_is_refused_and_a_damaged_file_is_fetched_again(
-    node: MakeNode, add_map: Callable[..., MapRecord], store: tuple[str, Path]
+    pair: tuple[SharedCatalog, SharedCatalog], store: tuple[str, Path]
 ) -> None:
-    here, there = node("here"), node("there")
-    make_domain(here)
-    digest = add_map(here).sha256 or ""
-    here.activate("campus", 1, None)
-    there.follow()
+    here, there = pair
+    digest = here.map("campus", 1).sha256
     path, stored = there.map_path("campus", 1), store[1] / f"maps/{digest}.sqlite"
     whole = stored.read_bytes()
     for broken in (whole[:1000], whole[:-1] + b"x"):
@@ -378,13 +386,9 @@ def test_a_damaged_object_is_refused_and_a_damaged_file_is_fetched_again(
 
 
 def test_a_file_is_fetched_once_however_many_ask(
-    node: MakeNode, add_map: Callable[..., MapRecord], monkeypatch: pytest.MonkeyPatch
+    pair: tuple[SharedCatalog, SharedCatalog], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, there = node("here"), node("there")
-    make_domain(here)
-    add_map(here)
-    here.activate("campus", 1, None)
-    there.follow()
+    _, there = pair
     n_fetched, pieces = [], map_store.MapStore.map_pieces
     monkeypatch.setattr(map_store.MapStore, "map_pieces", lambda *given: n_fetched.append(1) or pieces(*given))
     threads = [threading.Thread(target=there.map_file, args=("campus", 1)) for _ in range(8)]
@@ -429,13 +433,9 @@ def test_the_cache_holds_its_size_and_keeps_what_is_in_use(node: MakeNode, add_m
 
 
 def test_a_full_disk_is_named_and_leaves_no_half_file(
-    node: MakeNode, add_map: Callable[..., MapRecord], monkeypatch: pytest.MonkeyPatch
+    pair: tuple[SharedCatalog, SharedCatalog], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, there = node("here"), node("there")
-    make_domain(here)
-    add_map(here)
-    here.activate("campus", 1, None)
-    there.follow()
+    _, there = pair
 
     def full(*_: object) -> Iterator[bytes]:
         yield b"half"
@@ -451,13 +451,9 @@ def test_a_full_disk_is_named_and_leaves_no_half_file(
 
 
 def test_backups_and_checks_want_no_file_that_the_store_keeps(
-    node: MakeNode, add_map: Callable[..., MapRecord], tmp_path: Path
+    node: MakeNode, pair: tuple[SharedCatalog, SharedCatalog], tmp_path: Path
 ) -> None:
-    here, there = node("here"), node("there")
-    make_domain(here)
-    add_map(here)
-    here.activate("campus", 1, None)
-    there.follow()
+    here, there = pair
     assert not inspect(there.data_dir, lambda _: None).damaged
     assert back_up(there.data_dir, tmp_path / "backup.tar", "0", lambda _: None).n_maps == 0
     restore(tmp_path / "backup.tar", tmp_path / "restored", lambda _: None)

@@ -11,15 +11,18 @@ from deepsimbad_client.recordings import video as videos
 from deepsimbad_client.recordings.sources import open_source
 
 
-@pytest.fixture
-def video(tmp_path):
+def filmed(path, codec):
     """Thirty frames, ten a second; the grey of each is five times its number."""
-    path = tmp_path / "drive.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 10, (64, 48))
     for number in range(30):
         writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
     writer.release()
     return path
+
+
+@pytest.fixture
+def video(tmp_path):
+    return filmed(tmp_path / "drive.avi", "MJPG")
 
 
 def grey(recording, frame):
@@ -85,11 +88,7 @@ def with_times(mp4, entries):
 
 
 def test_frames_of_a_changing_rate_have_the_times_at_which_they_are_shown(tmp_path):
-    path = tmp_path / "phone.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
-    for number in range(30):
-        writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
-    writer.release()
+    path = filmed(tmp_path / "phone.mp4", "mp4v")
     path.write_bytes(with_times(path.read_bytes(), [(10, 1024), (20, 2048)]))  # of 10240 a second
     path.with_suffix(".CSV").write_text("time_s,x_m,y_m\n" + "".join(f"{at / 10},{at},0\n" for at in range(80)))
     recording = open_source(str(path))
