@@ -147,3 +147,7 @@ def test_without_the_drives_of_a_triplet_it_says_which_are_missing(deepsimbad, t
     assert ran.code == 1
     assert "has the drives of no triplet" in ran.err
     assert all(date in ran.err for date in DATES.values())
+    for date in DATES.values():
+        np.save(tmp_path / f"{date}.npy", np.random.default_rng(3).normal(size=(60, 12)))
+    ran = deepsimbad("experiment", "paper", "--nclt", tmp_path, *QUICK)
+    assert (ran.code, ran.err.count("it is 59 m long, and an episode takes 100 m")) == (1, 3)

@@ -95,7 +95,7 @@ def paper(
         tolerances_m=tuple(sorted({first_m, 5.0, 10.0, 25.0}, key=lambda m: (m != first_m, m))), **asked
     )
     measure = make_evaluator(evaluator, settings.compute())
-    recordings, missing = _opened(root, reading)
+    recordings, missing = _opened(root, config.nbv().episode_m, reading)
     triplets = runnable(recordings)
     if not triplets:
         raise InvalidSourceError(
@@ -165,16 +165,22 @@ def _telling(update: Callable[[float], None]) -> Callable[[str, float], None]:
     return tell
 
 
-def _opened(root: Path, reading: Mapping[str, Any]) -> tuple[dict[str, Recording], dict[str, str]]:
-    """The drives that are there, and why others are not."""
+def _opened(root: Path, least_m: float, reading: Mapping[str, Any]) -> tuple[dict[str, Recording], dict[str, str]]:
+    """The drives that are there and long enough, and why others are not."""
     recordings, missing = dict[str, Recording](), dict[str, str]()
     for season, date in SEASONS.items():
         ready = (root / f"{date}{suffix}" for suffix in sorted(ENCODING_SUFFIXES, reverse=True))
         source = next((str(file) for file in ready if file.is_file()), f"{NCLT_PREFIX}{root / date}")
         try:
-            recordings[season] = opened(source, **reading)
+            drive = opened(source, **reading)
         except SourceError as error:
             missing[season] = f"{date}: {' '.join(str(error).split())}"
+            continue
+        length_m = drive.frames[-1].position_m - drive.frames[0].position_m
+        if length_m < least_m:
+            missing[season] = f"{date}: it is {length_m:.0f} m long, and an episode takes {least_m:g} m"
+        else:
+            recordings[season] = drive
     return recordings, missing
 
 
@@ -189,7 +195,7 @@ def _tell_plan(
         click.echo(f"{season} is missing: {why}", err=True)
     run = ", ".join("-".join(triplet) for triplet in runnable(recordings))
     click.echo(f"landmark-training-test: {run}" + (f"; not run: {', '.join(not_run)}" if not_run else ""), err=True)
-    minutes = f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.0f} hours"
+    minutes = f"{max(seconds / 60, 1):.0f} min" if seconds < 5400 else f"{seconds / 3600:.0f} h"
     click.echo(f"about {minutes} on {available_cores()} cores, less what {out} keeps of earlier runs", err=True)
 
 

@@ -160,6 +160,11 @@ class NbvConfig:
     # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
 
+    @property
+    def episode_m(self) -> float:
+        """Metres that the longest episode takes."""
+        return self.n_steps * max(self.actions_m)
+
 
 @dataclass(frozen=True)
 class NbvReport:
@@ -288,11 +293,10 @@ def starts_of(config: NbvConfig, test: Drive) -> NDArray[np.int64]:
 
     Raises InvalidMapConfigError: the test traverse is shorter than an episode.
     """
-    travel_m = config.n_steps * max(config.actions_m)
     drive = TestDrive(Query.uninformative(1), test.route(), np.empty(0, np.int64))
-    starts = drive.starts(travel_m, config.episodes, config.seed)
+    starts = drive.starts(config.episode_m, config.episodes, config.seed)
     if starts.size == 0:
-        raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {travel_m:g} m")
+        raise InvalidMapConfigError(f"the test traverse is shorter than an episode of {config.episode_m:g} m")
     return starts
 
 
