@@ -48,6 +48,8 @@ def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, 
     out, err = running.communicate(timeout=60)
     assert running.returncode == code, err
     assert out == "", "logs go to standard error"
+    (ready,) = (json.loads(line) for line in err.splitlines() if '"message": "ready"' in line)
+    assert ready["console"] == f"{ready['url']}/console"
     assert (folder / "catalog.sqlite").exists()
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 

@@ -85,7 +85,7 @@ def demo(folder: Path, frames: int, seed: int) -> None:
         )
         _say("8. Pictures: " + ", ".join(str(picture) for picture in pictures))
         if sys.stdin.isatty() and sys.stdout.isatty():
-            _say(f"\nThe service stays up at {server.url} (API: {server.url}/docs). Ctrl-C ends it.")
+            _say(f"\nThe service stays up: look at {server.url}/console (API: {server.url}/docs). Ctrl-C ends it.")
             server.wait()
 
 

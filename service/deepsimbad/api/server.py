@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import islice
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -130,8 +131,8 @@ class _Server(uvicorn.Server):
         host, port = addresses[0]
         reached = "localhost" if host in {"0.0.0.0", "::"} else f"[{host}]" if ":" in host else host  # noqa: S104
         url = f"{'https' if self.config.is_ssl else 'http'}://{reached}:{port}"
-        told = {"addresses": [f"{host}:{port}" for host, port in addresses], "url": url, "docs": f"{url}/docs"}
-        log.info("ready", extra=told)
+        pages = {"console": f"{url}/console", "docs": f"{url}/docs"}
+        log.info("ready", extra={"addresses": [f"{host}:{port}" for host, port in addresses], "url": url, **pages})
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End connections and requests, then the application: also where nobody waits, its files are closed."""
@@ -204,9 +205,9 @@ def serve(settings: Settings, create: bool = False) -> None:
         )
     configure_logging(settings.log_level)
     changed = {  # none of them is a secret
-        name: getattr(settings, name)
+        name: str(value) if isinstance(value, Path) else value
         for name, field in Settings.model_fields.items()
-        if name != "data_dir" and getattr(settings, name) != field.default
+        if name != "data_dir" and (value := getattr(settings, name)) != field.default
     }
     where = str(settings.data_dir.resolve())
     log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
