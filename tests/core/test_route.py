@@ -150,3 +150,11 @@ def test_same_places_in_the_plane():
     route = Route(x, x_m=x, y_m=np.zeros(10))
     frames = Route(np.array([0.0, 3.0]), x_m=np.array([2.2, 5.2]), y_m=np.array([0.3, 0.3]))
     assert same_places(frames, route).tolist() == [[2, 0], [5, 1]]
+
+
+def test_distance_is_in_the_plane_where_both_sides_know_it_else_along_the_route():
+    images, x_m, y_m = np.arange(3), np.array([0.0, 1.0, np.nan]), np.array([0.0, 0.0, np.nan])
+    route = Route(np.arange(3.0), False, x_m, y_m)
+    assert route.apart_m(images, 2.0, 0.0, 0.5).tolist() == [0.5, pytest.approx(1.118, abs=1e-3), 0.0]
+    assert route.apart_m(images, 2.0, None, None).tolist() == [2.0, 1.0, 0.0]
+    assert Route(np.arange(10.0), closed=True).apart_m(images, 9.0, 0.0, 0.0)[0] == 1.0

@@ -146,13 +146,9 @@ class Scene:
         return seen
 
     def apart_m(self, row: int, images: NDArray[np.int64]) -> NDArray[np.float64]:
-        """[k] distance from a frame to map images, in the plane where both know it, else along the route."""
-        frame, route = self.recording.frames[row], self.route
-        along = np.abs(route.offset_m(route.position_m[images], frame.position_m))
-        if frame.x_m is None or frame.y_m is None or route.x_m is None or route.y_m is None:
-            return along
-        plane = np.hypot(route.x_m[images] - frame.x_m, route.y_m[images] - frame.y_m)
-        return np.where(np.isfinite(plane), plane, along)
+        """[k] distance from a frame to map images, as `Route.apart_m`."""
+        frame = self.recording.frames[row]
+        return self.route.apart_m(images, frame.position_m, frame.x_m, frame.y_m)
 
     def nearest_right(self, row: int) -> int | None:
         """The right answer nearest to a frame; None where the map does not hold its place."""

@@ -10,6 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from deepsimbad.cli.terminal import (
+    FRAMES_A_SECOND,
     RELEVANCES,
     data_dir_option,
     evaluator_option,
@@ -65,7 +66,6 @@ from deepsimbad_client.recordings.options import (
 
 Encode: TypeAlias = Callable[[Recording, Evaluator, Callable[[float], None]], Iterable[EncodedBlock] | None]
 """Encodes a recording elsewhere, telling how far it is; None: it is encoded here."""
-_FRAMES_A_SECOND = 150.0  # that are encoded, against which the stages of a remap are weighed
 
 
 def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[float, ...]:
@@ -230,9 +230,9 @@ def _stages(
     n_frames = {role: len(recording.frames) for role, recording in recordings.items()}
     ready = recordings["training"].encodings
     dim = (measure.encoding_dim or 0) if ready is None else ready.shape[1]
-    reading = {f"read {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
+    reading = {f"read {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
     if keeps_pictures:
-        reading |= {f"keep pictures of {role}": n / _FRAMES_A_SECOND for role, n in n_frames.items()}
+        reading |= {f"keep pictures of {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
     return reading | remap_stages(
         config, n_frames["training"], n_frames.get("landmarks", 0), dim, learns(measure, config.relevance)
     )

@@ -36,6 +36,7 @@ from deepsimbad_client.tables import print_whole
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
+FRAMES_A_SECOND = 150.0  # that are encoded, against which the other stages of a bar are weighed
 RELEVANCES = click.Choice([relevance.value for relevance in Relevance])
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
 json_list_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON list.")

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from deepsimbad.cli.experiment import json_file_option, kept_in, tell, tolerance_option, true_images, usual_tolerance_m
-from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar, render
+from deepsimbad.cli.terminal import (
+    FRAMES_A_SECOND,
+    data_dir_option,
+    evaluator_option,
+    given_settings,
+    print_table,
+    progress_bar,
+    render,
+)
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
 from deepsimbad.errors import ImageTooLargeError, InvalidImageError
@@ -32,7 +40,6 @@ from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
 
-_FRAMES_A_SECOND = 150.0  # that are encoded, against which the other stages are weighed
 _STRETCHES_TOLD = 5
 
 
@@ -82,7 +89,7 @@ def try_(
     names = {role: recording.name for role, recording in recordings.items()}
     tolerance_m = usual_tolerance_m(*recordings.values()) if tolerance is None else tolerance
     out = out or Path(re.sub(r"[^\w.-]+", "_", f"try-{names['database']}-{names['queries']}"))
-    stages = {f"read {role}": len(recording.frames) / _FRAMES_A_SECOND for role, recording in recordings.items()}
+    stages = {f"read {role}": len(recording.frames) / FRAMES_A_SECOND for role, recording in recordings.items()}
     encoded: dict[str, EncodedRecording] = {}
     stages |= TRIAL_STAGES | {"pictures": 2.0}
     with progress_bar(stages, "try", leaves=kept_in(out)) as progress:

@@ -117,6 +117,16 @@ class Route:
         half = self.length_m / 2
         return np.asarray((offset + half) % self.length_m - half)
 
+    def apart_m(
+        self, images: NDArray[np.int64], position_m: float, x_m: float | None, y_m: float | None
+    ) -> NDArray[np.float64]:
+        """[k] distance of images from a place, in the plane where both are known there, else along the route."""
+        along = np.abs(self.offset_m(self.position_m[images], position_m))
+        if x_m is None or y_m is None or self.x_m is None or self.y_m is None:
+            return along
+        plane = np.hypot(self.x_m[images] - x_m, self.y_m[images] - y_m)
+        return np.where(np.isfinite(plane), plane, along)
+
     def wrapped(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Positions within the first turn of a closed route; of an open one as they are."""
         if not self.closed or self.length_m <= 0:

@@ -3,7 +3,6 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from deepsimbad_client import errors
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.replay import Journal, Scene, right_answers
+from deepsimbad_client.replay import Journal, right_answers
 from deepsimbad_client.replay.passive import Replay, Step, replay
 from deepsimbad_client.replay.report import summarise
 
@@ -139,20 +138,6 @@ def test_a_domain_without_a_map_cannot_be_replayed_against(client, encodings, tm
 
 
 # The truth
-
-
-def scene_of(frames, route):
-    """As much of a scene as measures distances."""
-    scene = SimpleNamespace(recording=Recording("r", frames), route=route)
-    return lambda row: Scene.apart_m(scene, row, np.arange(route.n_images)).tolist()  # type: ignore[arg-type]
-
-
-def test_distance_is_in_the_plane_where_both_sides_know_it_else_along_the_route():
-    x_m, y_m = np.array([0.0, 1.0, np.nan]), np.array([0.0, 0.0, np.nan])
-    frames = [Frame(0, "0", 2.0, x_m=0.0, y_m=0.5), Frame(1, "1", 2.0)]
-    assert scene_of(frames, Route(np.arange(3.0), False, x_m, y_m))(0) == [0.5, pytest.approx(1.118, abs=1e-3), 0.0]
-    assert scene_of(frames, Route(np.arange(3.0), False, x_m, y_m))(1) == [2.0, 1.0, 0.0]
-    assert scene_of([Frame(0, "0", 9.0)], Route(np.arange(10.0), closed=True))(0)[0] == 1.0
 
 
 def test_a_place_driven_the_other_way_is_no_right_answer_and_frames_taken_backwards_look_forwards():

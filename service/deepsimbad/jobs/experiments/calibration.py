@@ -130,10 +130,10 @@ def views_until_found(is_near: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(np.where(is_near.any(axis=1), is_near.argmax(axis=1) + 1, is_near.shape[1] + 1), np.int64)
 
 
-def smallest_set(mass: NDArray[np.float64], share: float = 0.95) -> NDArray[np.bool_]:
-    """[n] whether an image is in the smallest set that holds a share; with its last one all that tie with it."""
+def smallest_set(mass: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[n] whether an image is in the smallest set that holds 95 %; with its last one all that tie with it."""
     descending = np.sort(mass)[::-1]
-    n_before = (np.cumsum(descending) < share * mass.sum() * (1 - 1e-12)).sum()
+    n_before = (np.cumsum(descending) < 0.95 * mass.sum() * (1 - 1e-12)).sum()
     return np.asarray(mass >= descending[n_before])
 
 

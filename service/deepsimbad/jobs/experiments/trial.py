@@ -175,17 +175,10 @@ def _outcome(
     if rank is None:
         return Outcome(best, None, None, None, None)
     true = nearest if nearest in truth else int(truth[truth.size // 2])  # a file of ground truth may know it better
-    return Outcome(best, true, rank, _apart_m(map_, best, true), _apart_m(map_, int(mass.argmax()), true))
-
-
-def _apart_m(map_: Map, image: int, other: int) -> float:
-    """Metres between map images: in the plane where both are known, else along the route."""
     route = map_.route
-    if route.x_m is not None and route.y_m is not None:
-        plane_m = float(np.hypot(route.x_m[other] - route.x_m[image], route.y_m[other] - route.y_m[image]))
-        if np.isfinite(plane_m):
-            return plane_m
-    return abs(float(route.offset_m(route.position_m[[other]], float(route.position_m[image]))[0]))
+    x_m, y_m = (None if axis is None else float(axis[true]) for axis in (route.x_m, route.y_m))
+    apart_m = route.apart_m(np.array([best, mass.argmax()]), float(route.position_m[true]), x_m, y_m)
+    return Outcome(best, true, rank, *apart_m.tolist())
 
 
 def _stretches(queries: Drive, outcomes: Sequence[Outcome]) -> list[Stretch]:
