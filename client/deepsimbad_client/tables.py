@@ -12,6 +12,9 @@ _UNBOUNDED = 100_000  # columns: as wide as it would like to be
 
 def print_whole(table: Table, console: Console) -> None:
     """Print a table; where it does not fit a line a cell, since rich would cut names and leave columns out."""
+    if table.title and not table.row_count:
+        console.print(f"{table.title}: none")
+        return
     width = Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = max(PIPE_COLUMNS, width)

@@ -27,3 +27,9 @@ def test_nothing_is_cut(monkeypatch, columns, is_terminal):
     is_down = is_terminal and columns < 140
     assert ("│" in shown) == (not is_down)
     assert not is_terminal or max(map(len, shown.splitlines())) <= columns
+
+
+def test_an_empty_table_says_so():
+    written = io.StringIO()
+    print_whole(Table(*NAMES, title="jobs"), Console(file=written, width=60))
+    assert written.getvalue() == "jobs: none\n"
