@@ -301,7 +301,10 @@ def _view_in(
 @click.confirmation_option("--yes", prompt="Delete the domain with its recordings and maps?")
 @data_dir_option
 def delete_domain(domain: str) -> None:
-    """Delete a domain with everything it holds."""
+    """Delete a domain with everything it holds.
+
+    Beside a running service its sessions end within `session_sweep_s`, half a minute.
+    """
     existing_data_dir()
     with open_given_catalog() as catalog:
         catalog.delete_domain(domain)
