@@ -16,6 +16,25 @@ def test_even_spacing_has_equal_cells():
         np.testing.assert_allclose(route.cell_m, 2.0)
 
 
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("n", [1, 2, 36, 700])
+def test_a_bin_of_the_histogram_holds_what_lies_in_it(n, closed):
+    """Of unevenly spaced images none leaves an empty bin beside it; one of a stop stands for a stretch or for none."""
+    rng = np.random.default_rng(n)
+    position_m, mass = np.sort(2.0 * n * rng.random(n)), rng.dirichlet(np.ones(n))
+    position_m[3:6] = position_m[3:4]
+    route = Route(position_m, closed)
+    edges_m, held = route.histogram_edges_m, route.histogram_of(mass)
+    assert (held > 0).all()
+    until_m = np.append((position_m[1:] + position_m[:-1]) / 2, edges_m[-1])
+    from_m = np.append(edges_m[0], until_m[:-1])
+    for first_m, last_m, share in zip(edges_m, edges_m[1:], held, strict=False):
+        within_m = np.clip(np.minimum(last_m, until_m) - np.maximum(first_m, from_m), 0, None)
+        length_m = np.maximum(until_m - from_m, 1e-12)
+        points = (until_m == from_m) & (until_m > first_m) & (until_m <= last_m)
+        assert share == pytest.approx(mass @ (within_m / length_m) + mass[points].sum() + (n == 1), abs=1e-9)
+
+
 def test_a_stop_shares_one_cell():
     route = Route(np.array([0.0, 1.0, 2.0, 2.0, 2.0, 2.0, 3.0, 4.0]))
     np.testing.assert_allclose(route.cell_m[2:6].sum(), 1.0)

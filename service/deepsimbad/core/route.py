@@ -182,18 +182,23 @@ class Route:
         return np.linspace(self.start_m, self.start_m + self.length_m, n_bins + 1)
 
     def histogram_of(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[b] what those bins hold of masses of map images [n]."""
-        return _sums_up_to(mass, self._bin_ends)
+        """[b] what those bins hold of masses of map images [n]; each is spread over the stretch it stands for."""
+        whole, share = self._bin_ends
+        begun = share * mass[np.minimum(whole, self.n_images - 1)]
+        held = _sums_up_to(mass, whole) + begun
+        held[1:] -= begun[:-1]
+        return np.maximum(held, 0.0)  # but for rounding it is no less
 
     @cached_property
-    def _bin_ends(self) -> NDArray[np.intp]:
-        """[b] the map image after the last one of every bin."""
-        n_bins = self.histogram_edges_m.size - 1
-        width_m = self.length_m / n_bins
-        if width_m <= 0:
-            return np.array([self.n_images])
-        bins = np.minimum(((self.position_m - self.start_m) / width_m).astype(np.intp), n_bins - 1)
-        return np.searchsorted(bins, np.arange(n_bins), side="right")
+    def _bin_ends(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """[b] how many images' stretches end before the end of every bin, and the share of the next that lies in it."""
+        until_m = np.append((self.position_m[1:] + self.position_m[:-1]) / 2, self.histogram_edges_m[-1])
+        from_m, end_m = np.append(self.start_m, until_m), self.histogram_edges_m[1:]
+        whole = np.searchsorted(until_m, end_m, side="right")
+        next_one = np.minimum(whole, self.n_images - 1)
+        length_m = until_m[next_one] - from_m[next_one]
+        share = np.where(whole < self.n_images, (end_m - from_m[next_one]) / np.maximum(length_m, _LEAST_LENGTH_M), 0.0)
+        return whole, share
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
