@@ -44,7 +44,8 @@ SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as mo
 LEAST_CORRELATION = 0.2
 # Recordings of one day teach that what comes will look as the map does. On NetVLAD's Nordland, where one drive alone
 # holds 89 % of single views in their 95 % sets, copies with noise left 39 % (correlation 0.997), 57 % (0.97) and 80 %
-# (0.90); real second drives measured 0.51 to 0.75. Robots may drive under one light for ever: it is told, not refused.
+# (0.90); real second drives correlate by 0.51 to 0.75 (prototypes; no command prints these). Robots may drive under
+# one light for ever: it is told, not refused.
 LIKE_ONE_DAY = 0.9
 ONE_RECORDING = 0.999  # copies of one, which teach nothing
 LEAST_PLACES = 30  # that both saw

@@ -5,7 +5,7 @@ Every such catalog is a copy of the log as far as it was read, and changes share
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -268,12 +268,19 @@ class SharedCatalog(Catalog):
         for name in names:
             self._publish(name, partial(self._keep_administrator, name))
 
-    def create_domain(self, name: str, *about: Any, **more: Any) -> tuple[DomainRecord, bool]:
+    def create_domain(
+        self,
+        name: str,
+        evaluator: dict[str, Any],
+        closed: bool,
+        actions_m: Sequence[float],
+        max_domains: int | None = None,
+    ) -> tuple[DomainRecord, bool]:
         """As `Catalog.create_domain`."""
         create = super().create_domain
 
         def change() -> bool:
-            _, is_new = create(name, *about, **more)
+            _, is_new = create(name, evaluator, closed, actions_m, max_domains)
             if is_new:
                 self._keep_administrator(name)
             return is_new
