@@ -100,5 +100,5 @@ def jpegs(n_pictures: int) -> list[bytes]:
     spacing_m, date = 1.75, drive_date(next(iter(PAPER_DATES)))
     world = World(0, drive_length_m(n_pictures, spacing_m))
     renderer = Renderer(world, Drive(world.route, 0, date, n_pictures, spacing_m))
-    upright = (cv2.rotate(renderer.stored(frame), cv2.ROTATE_90_CLOCKWISE) for frame in range(n_pictures))
+    upright = (cv2.rotate(renderer.stored_picture(frame), cv2.ROTATE_90_CLOCKWISE) for frame in range(n_pictures))
     return [cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes() for picture in upright]

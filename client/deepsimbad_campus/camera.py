@@ -26,7 +26,7 @@ AHEAD_M = np.asarray(FOCAL_PX * EYE_M / (np.arange(GROUND_ROW, HEIGHT) - HORIZON
 
 
 class View(NamedTuple):
-    """Where the camera is and what it looks along: clockwise from north, up and leaning right."""
+    """The camera's place, its heading (clockwise from north), pitch (up) and roll (leaning right)."""
 
     north_m: float
     east_m: float
@@ -48,15 +48,15 @@ def project(right_ahead: Array, height_m: Array | float = 0.0) -> Array:
 
 def clip_near(polygon: Array) -> Array:
     """The part of an [n, 2] ground polygon (right, ahead) that lies ahead of the camera; may be empty."""
-    ahead, following = polygon[:, 1] - NEAR_M, np.roll(polygon, -1, axis=0)
-    crossing = (ahead < 0) != (following[:, 1] < NEAR_M)
-    share = ahead / np.where(crossing, ahead - (following[:, 1] - NEAR_M), 1.0)
+    ahead_m, following = polygon[:, 1] - NEAR_M, np.roll(polygon, -1, axis=0)
+    crossing = (ahead_m < 0) != (following[:, 1] < NEAR_M)
+    share = ahead_m / np.where(crossing, ahead_m - (following[:, 1] - NEAR_M), 1.0)
     cuts = polygon + share[:, None] * (following - polygon)
-    return np.asarray(np.stack([polygon, cuts], axis=1)[np.stack([ahead >= 0, crossing], axis=1)], np.float64)
+    return np.asarray(np.stack([polygon, cuts], axis=1)[np.stack([ahead_m >= 0, crossing], axis=1)], np.float64)
 
 
 def near_cut(ends: Array) -> Array:
-    """[2] what is left of a wall that goes past the camera, as shares of the way between its [2, 2] feet."""
+    """[2] the ends of the part of a wall that is ahead of the camera, as shares of the way between its feet [2, 2]."""
     z0, z1 = ends[:, 1]
     return np.array([(NEAR_M - z0) / (z1 - z0) if z < NEAR_M else end for z, end in ((z0, 0.0), (z1, 1.0))])
 
@@ -68,9 +68,9 @@ def sixteenths(pixels: Array) -> NDArray[np.int32]:
 
 def fill(image: Image, ground: Array, ink: Colour) -> None:
     """Fill a convex [n, 2] ground polygon (right, ahead) on the canvas, or on a mask of the ground."""
-    seen, is_mask = clip_near(ground), image.ndim == 2
-    if len(seen) >= 3:
-        outline = sixteenths(project(seen) - (0, GROUND_ROW if is_mask else 0))
+    polygon, is_mask = clip_near(ground), image.ndim == 2
+    if len(polygon) >= 3:
+        outline = sixteenths(project(polygon) - (0, GROUND_ROW if is_mask else 0))
         cv2.fillConvexPoly(image, outline, ink, cv2.LINE_8 if is_mask else cv2.LINE_AA, 4)
 
 

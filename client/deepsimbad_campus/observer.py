@@ -23,12 +23,12 @@ from deepsimbad_campus.things import KINDS, around
 from deepsimbad_campus.world import SIGHT_M, SIGNS, World
 
 DETECTIONS, CAPTIONS = "detections.jsonl", "captions.csv"
-LEAST_SIDE, LEAST_SHOWN = 0.012, 0.35  # of the image's, and of a box that nothing hides
+LEAST_SIDE, LEAST_SHOWN = 0.012, 0.35  # a box's sides as shares of the image's; share of a box that nothing hides
 CELLS = (64, 84)  # columns and rows that tell what hides what
 HIDING = ("building", "wall", "car")
 FALSE_ALARMS = 0.6  # a picture, on average
-MISSED, WRONG, JITTER = 0.06, 0.03, 0.06  # of objects seen well; of labels; of a box's sides
-NAMED, OMITTED, MISTAKEN = 7, 0.15, 0.08  # by a person: at most so many; shares
+MISSED, WRONG, JITTER = 0.06, 0.03, 0.06  # shares of objects seen well, of labels, of a box's sides
+NAMED, OMITTED, MISTAKEN = 7, 0.15, 0.08  # by a person: phrases at most; shares of them left out, and misnamed
 WORDS = {
     "brick building": ("red brick building", "brick house", "old brick building"),
     "sandstone building": ("sandstone building", "yellow stone building", "sand-coloured stone house"),
@@ -47,7 +47,7 @@ SKIES = {"winter": "Snow lies around.", "spring": "It is spring.", "summer": "Su
 
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, in shares of the picture's sides
-Seen = tuple[str, Box]  # label and box of an object in a picture
+Sighting = tuple[str, Box]  # label and box of an object in a picture
 
 
 class Observer:
@@ -57,10 +57,10 @@ class Observer:
         self._world, self._drive = world, drive
         self._season = season_of(drive.date, world.seed)
 
-    def _seen(self, frame: int) -> list[Seen]:
-        """All that stands in a picture, nearest first, but for what others hide or hardly shows."""
+    def _sightings(self, frame: int) -> list[Sighting]:
+        """The objects in a frame's picture, nearest first, without those that are hidden or tiny."""
         hidden = np.zeros(CELLS, np.bool_)
-        shown: list[Seen] = []
+        sightings: list[Sighting] = []
         for _, label, box in sorted(self._standing(self._drive.view(frame), frame), key=itemgetter(0)):
             left, top, right, bottom = np.clip(box, 0, 1).tolist()
             if right - left < LEAST_SIDE or bottom - top < LEAST_SIDE:
@@ -68,10 +68,10 @@ class Observer:
             columns = slice(int(left * CELLS[0]), int(np.ceil(right * CELLS[0])))
             rows = slice(int(top * CELLS[1]), int(np.ceil(bottom * CELLS[1])))
             if 1 - hidden[columns, rows].mean() >= LEAST_SHOWN:
-                shown.append((label, (left, top, right, bottom)))
+                sightings.append((label, (left, top, right, bottom)))
             if label.endswith(HIDING):
                 hidden[columns, rows] = True
-        return shown
+        return sightings
 
     def files(self, names: list[str]) -> tuple[bytes, bytes]:
         """`detections.jsonl`, a line a picture, and `captions.csv`, of pictures by their files' names."""
@@ -79,41 +79,41 @@ class Observer:
         rows = csv.writer(table, lineterminator="\n")
         rows.writerow(("name", "text"))
         for frame, name in enumerate(names):
-            seen = self._seen(frame)
-            lines.append(json.dumps({"name": name, "objects": list(self._detected(frame, seen))}) + "\n")
-            rows.writerow((name, self._told(frame, seen)))
+            sightings = self._sightings(frame)
+            lines.append(json.dumps({"name": name, "objects": list(self._detections(frame, sightings))}) + "\n")
+            rows.writerow((name, self._caption(frame, sightings)))
         return "".join(lines).encode(), table.getvalue().encode()
 
-    def _detected(self, frame: int, seen: list[Seen]) -> Iterator[dict[str, Any]]:
+    def _detections(self, frame: int, sightings: list[Sighting]) -> Iterator[dict[str, Any]]:
         """What a detector makes of a picture."""
         rng = stream(self._drive.seed, f"detector {self._drive.date}", frame)
-        harder = 0.12 * self._season.snow + 4 * self._season.haze_per_m
-        for label, box in seen:
+        weather_misses = 0.12 * self._season.snow + 4 * self._season.haze_per_m
+        for label, box in sightings:
             sides = np.array([box[2] - box[0], box[3] - box[1]])
-            missed = MISSED + harder + 0.35 * np.exp(-float(sides.min()) / 0.03)
-            missed += 0.25 * (1 - self._season.leaf_share) * (label in {"tree", "bush"})
-            draws, moved = rng.random(3), rng.normal(0, JITTER, 4) * np.tile(sides, 2)
-            if draws[0] < missed:
+            miss_chance = MISSED + weather_misses + 0.35 * np.exp(-float(sides.min()) / 0.03)
+            miss_chance += 0.25 * (1 - self._season.leaf_share) * (label in {"tree", "bush"})
+            draws, offsets = rng.random(3), rng.normal(0, JITTER, 4) * np.tile(sides, 2)
+            if draws[0] < miss_chance:
                 continue
-            wrong = (*WORDS, *SIGNS)[int(draws[2] * (len(WORDS) + len(SIGNS)))]
-            score = float(np.clip(rng.normal(0.95 - 0.6 * missed, 0.08), 0.3, 0.99))
-            yield _detection(wrong if draws[1] < WRONG else label, np.array(box) + moved, score)
+            wrong_label = (*WORDS, *SIGNS)[int(draws[2] * (len(WORDS) + len(SIGNS)))]
+            score = float(np.clip(rng.normal(0.95 - 0.6 * miss_chance, 0.08), 0.3, 0.99))
+            yield _detection(wrong_label if draws[1] < WRONG else label, np.array(box) + offsets, score)
         for _ in range(rng.poisson(FALSE_ALARMS)):
             label, centre, size = rng.choice(list(WORDS)), rng.uniform(0.1, 0.9, 2), rng.uniform(0.03, 0.3, 2)
             yield _detection(label, np.concatenate([centre - size / 2, centre + size / 2]), rng.uniform(0.3, 0.6))
 
-    def _told(self, frame: int, seen: list[Seen]) -> str:
+    def _caption(self, frame: int, sightings: list[Sighting]) -> str:
         """What a person says of a picture."""
         rng = stream(self._drive.seed, f"caption {self._drive.date}", frame)
-        largest = sorted(seen, key=lambda thing: (thing[1][0] - thing[1][2]) * (thing[1][3] - thing[1][1]))
+        largest = sorted(sightings, key=lambda thing: (thing[1][0] - thing[1][2]) * (thing[1][3] - thing[1][1]))
         counts = Counter((label, _side(box)) for label, box in largest)
         phrases = []
         for label, side in list(counts)[:NAMED]:
             word = rng.choice(WORDS.get(label, (label,)))
-            omitted, mistaken = rng.random(2)
-            if mistaken < MISTAKEN:
+            omission, mistake = rng.random(2)
+            if mistake < MISTAKEN:
                 word = rng.choice(WORDS[list(WORDS)[rng.integers(0, len(WORDS))]])
-            if omitted < OMITTED:
+            if omission < OMITTED:
                 continue
             n = min(counts[label, side], len(NUMBERS) - 1)
             plural = "" if n < 2 else "es" if word.endswith("h") else "s"
@@ -147,7 +147,7 @@ class Observer:
 
 
 def _box(view: View, ends: Array, height_m: float) -> Array:
-    """[4] of what stands between two feet [2, 2] (right, ahead), as the picture shows it, its lean left away."""
+    """[4] the box of what stands between two feet [2, 2] (right, ahead), in shares of the picture; roll is ignored."""
     low, high = project(ends), project(ends, height_m)
     middle = (camera.WIDTH / 2, camera.HEIGHT / 2 - camera.FOCAL_PX * np.tan(view.pitch_rad))
     corners = np.stack([np.minimum(low, high).min(axis=0), np.maximum(low, high).max(axis=0)])
@@ -155,7 +155,7 @@ def _box(view: View, ends: Array, height_m: float) -> Array:
 
 
 def _side(box: Box) -> str:
-    """Where in the picture it is."""
+    """Where in the picture a box lies, in words."""
     middle = (box[0] + box[2]) / 2
     return "on the left" if middle < 0.38 else "on the right" if middle > 0.62 else "ahead"
 

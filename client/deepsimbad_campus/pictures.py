@@ -173,7 +173,7 @@ def _broadleaf(colour: Image, alpha: Image, rng: np.random.Generator, season: Se
 
 
 def _branches(rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """[n, 4] from and to in pixels, [n] width and [n] what still grows from it: 6 is the trunk, 0 a twig."""
+    """[n, 4] both ends in pixels, [n] widths and [n] depths of a tree's branches: 6 is the trunk, 0 a twig."""
     spread, slender = rng.uniform(0.3, 0.62), rng.uniform(0.70, 0.80)
     branches: list[tuple[float, ...]] = []
 
@@ -185,11 +185,11 @@ def _branches(rng: np.random.Generator) -> tuple[Array, Array, Array]:
             grow(x1, y1, angle * 0.9 + turn, length * slender * rng.uniform(0.85, 1.1), width * 0.66, depth - 1)
 
     grow(0.0, 0.0, rng.normal(0, 0.04), 1.0, 13 * rng.uniform(0.7, 1.1), 6)
-    grown, margin = np.array(branches), 18
-    fit_y = (TREE_HEIGHT - margin) / grown[:, 3].max()
-    fit_x = min((TREE_WIDTH / 2 - margin) / max(np.abs(grown[:, 2]).max(), 1e-6), fit_y)
-    ends = np.tile([TREE_WIDTH / 2, TREE_HEIGHT - 1], 2) + grown[:, :4] * np.tile([fit_x, -fit_y], 2)
-    return ends, grown[:, 4], grown[:, 5]
+    limbs, margin = np.array(branches), 18
+    fit_y = (TREE_HEIGHT - margin) / limbs[:, 3].max()
+    fit_x = min((TREE_WIDTH / 2 - margin) / max(np.abs(limbs[:, 2]).max(), 1e-6), fit_y)
+    ends = np.tile([TREE_WIDTH / 2, TREE_HEIGHT - 1], 2) + limbs[:, :4] * np.tile([fit_x, -fit_y], 2)
+    return ends, limbs[:, 4], limbs[:, 5]
 
 
 def _conifer(colour: Image, alpha: Image, rng: np.random.Generator, season: Season) -> None:

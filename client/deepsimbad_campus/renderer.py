@@ -39,7 +39,7 @@ class Renderer:
         grain = stream(seed, f"grain {date}").normal(0, GRAIN, (width + 64, height + 64, 1))
         self._grain = np.clip(np.repeat(grain, 3, axis=2) + 128, 0, 255).astype(np.uint8)
 
-    def stored(self, frame: int) -> Image:
+    def stored_picture(self, frame: int) -> Image:
         """[1232, 1616, 3] BGR, the picture of a frame as it is stored: turned counter-clockwise."""
         view = self._drive.view(frame)
         # What is drawn, seen from the middle, leans and nods and turns: a stored column is an upright row, and stored
@@ -49,8 +49,8 @@ class Renderer:
         x, y = WIDTH / 2, HEIGHT / 2 - nod
         (wide, tall), (width, height) = camera.SEEN_SIZE, camera.UPRIGHT_SIZE
         turn = np.array([[sin, cos, tall / 2 - sin * x - cos * y], [-cos, sin, wide / 2 + cos * x - sin * y]])
-        seen = cv2.warpAffine(self.canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
-        picture = cv2.resize(seen, (height, width), interpolation=cv2.INTER_LINEAR)
+        window = cv2.warpAffine(self.canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
+        picture = cv2.resize(window, (height, width), interpolation=cv2.INTER_LINEAR)
         row, column = stream(self._world.seed + self._drive.date.toordinal(), "grain", frame).integers(0, 64, 2)
         grain = self._grain[row : row + width, column : column + height]
         return np.asarray(cv2.addWeighted(picture, 1.0, grain, 1.0, -128), np.uint8)
@@ -146,18 +146,18 @@ class Renderer:
     def _labels(self, shot: Shot) -> Image:
         """What every pixel below the horizon is paved with, an index of the tiles."""
         labels = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8)
-        sections, here = self._world.ahead(shot.position_m), shot.position_m
+        sections, position_m = self._world.ahead(shot.position_m), shot.position_m
         # Short pieces of path near by, where a bend shows; long ones far away.
-        pieces = here + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 125, 9)])
+        cuts_m = position_m + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 125, 9)])
         for section in sections:
             for outline, surface in section.patches:
                 fill(labels, shot.view.to_camera(outline), (LABELS[surface],))
         for section in reversed(sections):
-            first, last = max(section.stretch.start_m, here - 4), min(section.stretch.end_m, here + 125)
+            first, last = max(section.stretch.start_m, position_m - 4), min(section.stretch.end_m, position_m + 125)
             if first < last:
-                where = np.concatenate([[first], pieces[(first < pieces) & (pieces < last)], [last]])
+                path_m = np.concatenate([[first], cuts_m[(first < cuts_m) & (cuts_m < last)], [last]])
                 half, route = section.path_half_width_m, self._world.route
-                left, right = (shot.view.to_camera(route.place(where, side)) for side in (-half, half))
+                left, right = (shot.view.to_camera(route.place(path_m, side)) for side in (-half, half))
                 for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
                     fill(labels, quad, (LABELS[section.path_surface],))
         return labels
@@ -166,30 +166,34 @@ class Renderer:
         """Where the ground is in shade, 255 or 0."""
         mask, light = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8), shot.light
         north, east, up = light.sun
-        away, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
-        long, circle = np.hypot(*away), np.stack([np.cos(ring), np.sin(ring)], axis=1)
-        along, leaves, outlines = away / max(long, 1e-6), light.season.leaf_share, list[Array]()
+        reach_per_m, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
+        length_per_m, circle = np.hypot(*reach_per_m), np.stack([np.cos(ring), np.sin(ring)], axis=1)
+        direction, leaves, outlines = reach_per_m / max(length_per_m, 1e-6), light.season.leaf_share, list[Array]()
         for section in self._world.ahead(shot.position_m) if light.sunshine >= 0.15 else ():
             for block in section.blocks:
-                reach = away * block.height_m
+                reach = reach_per_m * block.height_m
                 reach = reach * min(1.0, LONGEST_SHADOW_M / max(np.hypot(*reach), 1e-6))
                 corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
                 outlines.append(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
             for place, kind, height, *_ in section.things:
-                reach, ahead = away * height * 0.62, shot.view.to_camera(place)[1]
+                reach, ahead = reach_per_m * height * 0.62, shot.view.to_camera(place)[1]
                 if kind in ("tree", "conifer") and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
-                    side = np.array([-along[1], along[0]]) * 0.12
+                    side = np.array([-direction[1], direction[0]]) * 0.12
                     outlines.append(place + np.stack([-side, side, reach + side, reach - side]))
                     bare = leaves < 0.15 and kind == "tree"
                     spread = circle * (height * (0.12 if bare else 0.16 + 0.12 * leaves))
-                    outlines.append(place + reach + (spread + np.outer(spread @ along * (1 + 0.5 * long - 1), along)))
+                    outlines.append(
+                        place
+                        + reach
+                        + (spread + np.outer(spread @ direction * (1 + 0.5 * length_per_m - 1), direction))
+                    )
         for outline in outlines:
             fill(mask, shot.view.to_camera(outline), (255,))
         return mask
 
     def _mark(self, shot: Shot) -> None:
         """Draw the path's joints and the road's broken line."""
-        route, here, light = self._world.route, shot.position_m, shot.light
+        route, position_m, light = self._world.route, shot.position_m, shot.light
         joint, paint = (light.colour(c, light.on_ground, 0) for c in ((112, 116, 118), (170, 200, 205)))
 
         def line(along_m: Array, right_m: Array, width_m: float, ink: tuple[int, ...]) -> None:
@@ -199,12 +203,12 @@ class Renderer:
             outline = np.stack([first - side, last - side, last + side, first + side])
             fill(shot.canvas, shot.view.to_camera(outline), ink)
 
-        for section in self._world.ahead(here):
+        for section in self._world.ahead(position_m):
             stretch, half, road = section.stretch, section.path_half_width_m, section.road_right_m
             if section.path_surface == "concrete":
-                for where in np.arange(stretch.start_m + 2, min(stretch.end_m, here + 30), 2.5):
-                    if where > here - 2:
-                        line(np.array([where, where]), np.array([-half, half]), 0.03, joint)
-            for where in np.arange(stretch.start_m, stretch.start_m + stretch.straight_m, 6.0):
-                if road is not None and here - 4 < where < here + 70:
-                    line(np.array([where, where + 3.0]), np.array([road, road]), 0.12, paint)
+                for joint_m in np.arange(stretch.start_m + 2, min(stretch.end_m, position_m + 30), 2.5):
+                    if joint_m > position_m - 2:
+                        line(np.array([joint_m, joint_m]), np.array([-half, half]), 0.03, joint)
+            for dash_m in np.arange(stretch.start_m, stretch.start_m + stretch.straight_m, 6.0):
+                if road is not None and position_m - 4 < dash_m < position_m + 70:
+                    line(np.array([dash_m, dash_m + 3.0]), np.array([road, road]), 0.12, paint)

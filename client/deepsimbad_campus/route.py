@@ -27,10 +27,10 @@ def stream(seed: int, name: str, block: int = 0) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode()), block])
 
 
-def smooth_line(rng: np.random.Generator, where: Array) -> Array:
+def smooth_line(rng: np.random.Generator, places: Array) -> Array:
     """[n] smooth noise at [n] places (not negative) along a line that has a standard normal knot at whole numbers."""
-    left = where.astype(np.int64)
-    knots, t = rng.standard_normal(int(left.max()) + 2), where - left
+    left = places.astype(np.int64)
+    knots, t = rng.standard_normal(int(left.max()) + 2), places - left
     t = t * t * (3 - 2 * t)
     return np.asarray(knots[left] * (1 - t) + knots[left + 1] * t, np.float64)
 
@@ -46,7 +46,7 @@ class Stretch(NamedTuple):
 
 
 class Route:
-    """The centre line every drive follows, in the local north-east plane: at least so long, never crossing itself."""
+    """The centre line every drive follows, in the local north-east plane: `length_m` or more, never crossing itself."""
 
     def __init__(self, seed: int, length_m: float) -> None:
         rng = stream(seed, "route")
@@ -89,7 +89,7 @@ class Route:
 
 
 def drive_length_m(n_frames: int, spacing_m: float) -> float:
-    """Route positions a drive of so many frames never goes beyond."""
+    """The route position that a drive of `n_frames` never goes beyond."""
     return START_M + -(-n_frames // BLOCK) * BLOCK * spacing_m + 1
 
 
@@ -109,17 +109,17 @@ class Drive:
         afternoon = datetime.datetime.combine(date, datetime.time(16), datetime.UTC)
         start = int(afternoon.timestamp()) * 1_000_000 + int(rng.integers(0, 3_600_000_000))
         self.utime = start + np.arange(n_frames) * INTERVAL_US + np.concatenate(jitter)[:n_frames]
-        self.position_m = along = (START_M + np.concatenate([[0.0], np.cumsum(np.concatenate(moves))]))[:n_frames]
+        self.position_m = position_m = (START_M + np.concatenate([[0.0], np.cumsum(np.concatenate(moves))]))[:n_frames]
         frames = np.arange(n_frames, dtype=np.float64)
         bias, lean = rng.uniform(-0.5, 0.5), rng.normal(0, np.deg2rad(2.6), 2)
 
-        def noise(name: str, where: Array) -> Array:
-            return smooth_line(stream(seed, f"{name} {date}"), where)
+        def noise(name: str, places: Array) -> Array:
+            return smooth_line(stream(seed, f"{name} {date}"), places)
 
-        self._right = np.clip(bias + 0.6 * noise("right", along / 19), -WIDEST_M, WIDEST_M)
-        self._turn = lean[0] + np.deg2rad(6.0) * noise("turn", along / 11)
-        self._pitch = lean[1] * 0.2 + np.deg2rad(0.55) * noise("pitch", along / 2.3)
-        self._roll = np.deg2rad(0.5) * noise("roll", along / 3.1)
+        self._right = np.clip(bias + 0.6 * noise("right", position_m / 19), -WIDEST_M, WIDEST_M)
+        self._turn = lean[0] + np.deg2rad(6.0) * noise("turn", position_m / 11)
+        self._pitch = lean[1] * 0.2 + np.deg2rad(0.55) * noise("pitch", position_m / 2.3)
+        self._roll = np.deg2rad(0.5) * noise("roll", position_m / 3.1)
         self.sunniness, self.exposure = noise("cloud", frames / 17), np.exp(0.11 * noise("exposure", frames / 7))
 
     def poses(self, utime: NDArray[np.int64]) -> tuple[Array, ...]:

@@ -114,13 +114,13 @@ class Light:
 
     def colour(self, colour: Colour, gain: Array, distance_m: float) -> tuple[int, ...]:
         """A surface's colour as the camera sees it at a distance."""
-        return ink(self._seen(np.array(colour), gain, distance_m))
+        return ink(self._apparent_colour(np.array(colour), gain, distance_m))
 
     def shine_on(self, picture: Image, gain: Array, distance_m: float) -> Image:
         """A picture of a surface's own colours as the camera sees it at a distance."""
-        table = np.clip(self._seen(np.arange(256)[:, None], gain, distance_m), 0, 255).astype(np.uint8)[None]
-        return np.asarray(cv2.LUT(picture, table), np.uint8)
+        table = np.clip(self._apparent_colour(np.arange(256)[:, None], gain, distance_m), 0, 255)
+        return np.asarray(cv2.LUT(picture, table.astype(np.uint8)[None]), np.uint8)
 
-    def _seen(self, colour: NDArray[Any], gain: Array, distance_m: float) -> Array:
+    def _apparent_colour(self, colour: NDArray[Any], gain: Array, distance_m: float) -> Array:
         share = self.haze(distance_m)
         return np.asarray(colour * gain * (1 - share) + self.air * share, np.float64)

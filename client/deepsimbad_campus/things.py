@@ -23,7 +23,7 @@ COATS: tuple[Colour, ...] = (
     (36, 34, 34), (140, 70, 40), (44, 40, 160), (70, 110, 60), (40, 150, 200), (170, 170, 175), (110, 60, 110),
 )  # fmt: skip
 METAL, WOOD, GLASS = (48, 50, 48), (60, 96, 130), (74, 66, 58)
-# A car's side, from the rear, [4] metres along and up; the cabin stands on the body.
+# A car's side, from the rear, [4] metres forward and up; the cabin stands on the body.
 BODY = np.array([(-2.1, 0.28), (-2.1, 0.95), (2.05, 0.82), (2.15, 0.28)]).T
 CABIN = np.array([(-1.8, 0.93), (-1.35, 1.48), (0.35, 1.46), (1.05, 0.86)]).T
 HALF_WIDTH_M = 0.86
@@ -51,7 +51,7 @@ def around(world: World, drive: Drive, frame: int) -> Iterator[Thing]:
 
 
 def _cars(section: Section, drive: Drive, route: Route, time_s: float) -> Iterator[Thing]:
-    """Those that stand in a section's bays during a drive, and those on its road."""
+    """The cars that stand in a section's bays during a drive, and those on its road."""
     for place, heading, number in section.bays:
         rng = stream(drive.seed, f"bay {drive.date}", number)
         if rng.random() < PARKED_SHARE:
@@ -61,12 +61,12 @@ def _cars(section: Section, drive: Drive, route: Route, time_s: float) -> Iterat
         rng = stream(drive.seed, f"traffic {drive.date}", section.stretch.number)
         for _ in range(rng.integers(1, 4)):
             speed = rng.uniform(6, 11) * rng.choice([-1, 1])
-            along = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M
+            loop_m = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M
             paint = int(rng.integers(0, len(CARS)))
-            if along <= section.stretch.straight_m:
-                where, lane = section.stretch.start_m + along, section.road_right_m + np.sign(speed) * LANE_M
-                turn = float(route.heading(where)) + (np.pi if speed < 0 else 0.0)
-                yield Thing(route.place(where, lane), "car", 1.5, paint, turn)
+            if loop_m <= section.stretch.straight_m:
+                position_m, right_m = section.stretch.start_m + loop_m, section.road_right_m + np.sign(speed) * LANE_M
+                turn = float(route.heading(position_m)) + (np.pi if speed < 0 else 0.0)
+                yield Thing(route.place(position_m, right_m), "car", 1.5, paint, turn)
 
 
 def _people(drive: Drive, route: Route, position_m: float, time_s: float) -> Iterator[Thing]:
@@ -74,21 +74,21 @@ def _people(drive: Drive, route: Route, position_m: float, time_s: float) -> Ite
     for cell in range(first, last + 1):
         rng = stream(drive.seed, f"people {drive.date}", cell)
         if rng.random() <= PEOPLE_SHARE:
-            home = (cell + rng.random()) * CELL_M
-            met_s = (home - START_M) / (drive.spacing_m / (INTERVAL_US / 1e6)) + rng.normal(0, 6)
+            home_m = (cell + rng.random()) * CELL_M
+            met_s = (home_m - START_M) / (drive.spacing_m / (INTERVAL_US / 1e6)) + rng.normal(0, 6)
             speed, side = rng.uniform(0.9, 1.5) * rng.choice([-1, 0, 1]), rng.choice([-1, 1])
             for k in range(rng.integers(1, 5)):
-                right, look = side * rng.uniform(0.9, 3.0), int(rng.integers(0, 1 << 31))
-                where = home + speed * float(np.clip(time_s - met_s, -40, 40)) + 0.9 * k
-                if where > 0:
-                    yield Thing(route.place(where, right), "person", 1.75, look, 2.2 * where if speed else 0.4)
+                right_m, look = side * rng.uniform(0.9, 3.0), int(rng.integers(0, 1 << 31))
+                walker_m = home_m + speed * float(np.clip(time_s - met_s, -40, 40)) + 0.9 * k
+                if walker_m > 0:
+                    yield Thing(route.place(walker_m, right_m), "person", 1.75, look, 2.2 * walker_m if speed else 0.4)
 
 
 def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
     """Cut the part of a wall that is in view into panels short enough to be sorted by distance.
 
-    Of each its distance ahead in metres, [2, 2] (right, ahead) of its left and right foot, and [2] where these lie
-    along the wall, 0 its left and 1 its right edge.
+    Yields of each panel its distance ahead in metres, [2, 2] (right, ahead) of its left and right foot, and [2] where
+    these lie along the wall, 0 its left and 1 its right edge.
     """
     (x0, z0), (x1, z1) = ends = view.to_camera(feet)
     if x1 * z0 - x0 * z1 <= 0 or max(z0, z1) < NEAR_M or min(z0, z1) > SIGHT_M:
@@ -164,18 +164,18 @@ def _draw_car(shot: Shot, car: Thing, centre: Array) -> None:
     shadow = np.stack([centre + nose * a + side * b for a, b in ((-2.3, -1), (2.3, -1), (2.3, 1), (-2.3, 1))])
     face(shadow, np.zeros(4), (46, 46, 48), light.in_shade)
     base = light.between(0.45)
-    for (along, up), colour in ((BODY, paint), (CABIN, GLASS)):
-        feet = centre + along[:, None] * nose
+    for (forward, up), colour in ((BODY, paint), (CABIN, GLASS)):
+        feet = centre + forward[:, None] * nose
         left, right = feet - HALF_WIDTH_M * side, feet + HALF_WIDTH_M * side
         faces = [(left, up, colour, base), (right, up, colour, base * 0.92)]
-        for k, own, tone in ((0, colour, 0.8), (1, paint, 1.12), (2, colour, 0.9)):  # rear, top and front
+        for k, face_colour, tone in ((0, colour, 0.8), (1, paint, 1.12), (2, colour, 0.9)):  # rear, top and front
             quad = np.stack([left[k], left[k + 1], right[k + 1], right[k]])
-            faces.append((quad, up[[k, k + 1, k + 1, k]], own, base * tone))
+            faces.append((quad, up[[k, k + 1, k + 1, k]], face_colour, base * tone))
         for args in sorted(faces, key=lambda args: -np.hypot(*args[0].mean(0))):
             face(*args)
     near, ring = -1.0 if centre @ side > 0 else 1.0, np.linspace(0, 2 * np.pi, 14, endpoint=False)
-    for along in (-1.35, 1.35) if distance < 45 else ():
-        hub = centre + nose * along + side * near * HALF_WIDTH_M
+    for axle_m in (-1.35, 1.35) if distance < 45 else ():
+        hub = centre + nose * axle_m + side * near * HALF_WIDTH_M
         face(hub + nose * 0.33 * np.cos(ring)[:, None], 0.33 + 0.33 * np.sin(ring), (24, 24, 26), light.in_shade)
 
 
@@ -229,7 +229,7 @@ class Kind(NamedTuple):
     draw: Callable[[Shot, Thing, Array], None]
     margin_m: float  # how far beside the view it may stand and still reach into it
     half_m: tuple[float, float]  # half its width: metres, and share of its size
-    height_m: tuple[float, float] = (0, 1)  # likewise
+    height_m: tuple[float, float] = (0, 1)  # its height: metres, and share of its size
 
     def measures(self, size_m: float) -> tuple[float, float]:
         """Metres of half its width and of its height."""

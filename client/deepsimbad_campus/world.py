@@ -9,7 +9,7 @@ from deepsimbad_campus.camera import Array, Colour
 from deepsimbad_campus.route import Route, Stretch, stream
 
 SIGHT_M, BEHIND_M = 130.0, 25.0  # nothing farther along the route than this is drawn
-NEIGHBOURS = 24  # buildings before that are looked at when a new one is placed
+NEIGHBOURS = 24  # the buildings last placed, which a new one must not meet
 # Every eight stretches are of these zones, shuffled.
 DECK = ("court", "street", "avenue", "twins", "field", "wall", "parking", "twins")
 BAY_NUMBERS = 64
@@ -60,13 +60,13 @@ class Block(NamedTuple):
         return np.stack([self.centre + x * forward + y * side for x, y in ((a, -b), (-a, -b), (-a, b), (a, b))])
 
     def contains(self, points: Array, margin_m: float) -> NDArray[np.bool_]:
-        """[n] whether [n, 2] points lie within it or so near."""
-        along, across = ((points - self.centre) @ axis for axis in self.axes)
-        near = (np.abs(along) < self.half[0] + margin_m) & (np.abs(across) < self.half[1] + margin_m)
+        """[n] whether [n, 2] points lie within the building or less than a margin from it."""
+        forward_m, right_m = ((points - self.centre) @ axis for axis in self.axes)
+        near = (np.abs(forward_m) < self.half[0] + margin_m) & (np.abs(right_m) < self.half[1] + margin_m)
         return np.asarray(near, np.bool_)
 
     def meets(self, other: "Block") -> bool:
-        """Whether another is less than a metre away: no axis of either separates them."""
+        """Whether another building is less than a metre away: no axis of either separates them."""
         axes = np.concatenate([self.axes, other.axes]).T
         a, b = self.corners() @ axes, other.corners() @ axes
         return not bool(((a.max(0) + 1.0 < b.min(0)) | (b.max(0) + 1.0 < a.min(0))).any())
@@ -75,11 +75,13 @@ class Block(NamedTuple):
 class Section:
     """One stretch and all that stands along it; things are placed by metres along and right of its straight part.
 
-    Nothing may stand on the route, nor on the buildings placed before, which grow.
+    Nothing may stand on the route, nor on `placed_blocks`, all buildings so far, to which it adds its own.
     """
 
-    def __init__(self, route: Route, stretch: Stretch, zone: str, rng: np.random.Generator, built: list[Block]) -> None:
-        self.stretch, self._rng, self._built = stretch, rng, built
+    def __init__(
+        self, route: Route, stretch: Stretch, zone: str, rng: np.random.Generator, placed_blocks: list[Block]
+    ) -> None:
+        self.stretch, self._rng, self._placed_blocks = stretch, rng, placed_blocks
         self.blocks: list[Block] = []
         self.facades: list[tuple[Array, Style]] = []  # [2, 2] feet of a wall's left and right edge, seen from outside
         self.things: list[Thing] = []
@@ -102,26 +104,26 @@ class Section:
         for _ in range(rng.integers(2, 6)):
             self._tree(rng.uniform(length, length + stretch.bend_m), rng.uniform(-25, 25), clearance=4.5)
         if rng.random() < 0.6:
-            along = rng.uniform(0.2, 0.8) * length
-            self._pave(along, along + rng.uniform(1.6, 4), -40, 40, "concrete")
+            along_m = rng.uniform(0.2, 0.8) * length
+            self._pave(along_m, along_m + rng.uniform(1.6, 4), -40, 40, "concrete")
 
-    def _point(self, along: float, right: float) -> Array:
-        return np.asarray(self._origin + along * self._axes[0] + right * self._axes[1], np.float64)
+    def _point(self, along_m: float, right_m: float) -> Array:
+        return np.asarray(self._origin + along_m * self._axes[0] + right_m * self._axes[1], np.float64)
 
     def _free(self, place: Array, clearance: float) -> bool:
         on_route = np.hypot(*(self._line - place).T).min() < clearance
-        return not (on_route or any(block.contains(place[None], 1.0)[0] for block in self._built[-NEIGHBOURS:]))
+        return not (on_route or any(block.contains(place[None], 1.0)[0] for block in self._placed_blocks[-NEIGHBOURS:]))
 
     def _build(
-        self, along: float, setback: float, size: tuple[float, ...], material: str, seed: int, clearance: float = 4.0
+        self, along_m: float, setback: float, size: tuple[float, ...], material: str, seed: int, clearance: float = 4.0
     ) -> None:
-        """Put up a building, if it fits: its near end and near face (negative is left), its width, depth and height."""
+        """Put up a building of (width, depth, height), if it fits, by its near end and near face (negative is left)."""
         width, depth, height = size
-        centre = self._point(along + width / 2, setback + np.copysign(depth / 2, setback))
+        centre = self._point(along_m + width / 2, setback + np.copysign(depth / 2, setback))
         block = Block(centre, self._axes, (width / 2, depth / 2), height)
-        if block.contains(self._line, clearance).any() or any(map(block.meets, self._built[-NEIGHBOURS:])):
+        if block.contains(self._line, clearance).any() or any(map(block.meets, self._placed_blocks[-NEIGHBOURS:])):
             return
-        self._built.append(block)
+        self._placed_blocks.append(block)
         self.blocks.append(block)
         details, corners = np.random.default_rng([seed, 7]), block.corners()
         floors = 0 if material == "wall" else max(1, int(height / details.uniform(3.1, 3.9)))
@@ -133,19 +135,21 @@ class Section:
 
     def _row(self, side: float, setbacks: tuple[float, float], share: float, heights: tuple[float, float]) -> None:
         """Line one side with buildings and gaps."""
-        rng, along = self._rng, self._rng.uniform(0, 6)
-        while along < self.stretch.straight_m - 4:
+        rng, along_m = self._rng, self._rng.uniform(0, 6)
+        while along_m < self.stretch.straight_m - 4:
             width = 8.0
             if rng.random() < share:
                 setback = side * rng.uniform(*setbacks)
                 width, depth, height = rng.uniform(9, 24), rng.uniform(9, 18), rng.uniform(*heights)
                 material = MATERIALS[rng.integers(0, len(MATERIALS))]
-                self._build(along, setback, (width, depth, height), material, int(rng.integers(0, 1 << 31)))
-            along = along + width + rng.uniform(2, 9)
+                self._build(along_m, setback, (width, depth, height), material, int(rng.integers(0, 1 << 31)))
+            along_m = along_m + width + rng.uniform(2, 9)
 
-    def _tree(self, along: float, right: float, species: int = -1, clearance: float = 3.0, height: float = 0.0) -> None:
+    def _tree(
+        self, along_m: float, right_m: float, species: int = -1, clearance: float = 3.0, height: float = 0.0
+    ) -> None:
         """Plant a tree, if there is room, of any species and height where none is given."""
-        place, rng = self._point(along, right), self._rng
+        place, rng = self._point(along_m, right_m), self._rng
         species = int(rng.integers(0, BUSH)) if species < 0 else species
         kind, height = "conifer" if species >= FIRST_CONIFER else "tree", height or rng.uniform(6, 13)
         self._put(Thing(place, kind, height, species, -1.0 if rng.random() < 0.5 else 1.0), clearance)
@@ -154,8 +158,8 @@ class Section:
         """Put posts or bushes beside the path, where there is room, anywhere along it where no place is given."""
         rng = self._rng
         for _ in range(count):
-            along = rng.uniform(0, self.stretch.straight_m) if at_m is None else at_m
-            place = self._point(along, rng.choice([-1, 1]) * rng.uniform(2.8, 6))
+            along_m = rng.uniform(0, self.stretch.straight_m) if at_m is None else at_m
+            place = self._point(along_m, rng.choice([-1, 1]) * rng.uniform(2.8, 6))
             sign, size = list(SIGNS)[rng.integers(0, len(SIGNS))], SIZES_M[kind] * rng.uniform(0.8, 1.3)
             self._put(Thing(place, sign if kind == "sign" else kind, size, BUSH, 1.0), 2.5)
 
@@ -163,8 +167,8 @@ class Section:
         if self._free(thing.place, clearance):
             self.things.append(thing)
 
-    def _bay(self, along: float, right: float, turn: float = 0.0) -> None:
-        place = self._point(along, right)
+    def _bay(self, along_m: float, right_m: float, turn: float = 0.0) -> None:
+        place = self._point(along_m, right_m)
         if self._free(place, 3.2):
             self.bays.append((place, self.heading_rad + turn, self.stretch.number * BAY_NUMBERS + len(self.bays)))
 
@@ -186,20 +190,20 @@ class Section:
         self._pave(-3, length + 3, middle - 3.6, middle + 3.6, "asphalt")
         self._row(side, (14, 18), 0.9, (6, 18))
         self._row(-side, (6, 9), 0.9, (6, 18))
-        for along in np.arange(4.0, length, 22):
-            self._posts("lamp", at_m=along)
-        for along in np.arange(2.0, length - 4, 6.2):
-            self._bay(along, middle - side * 2.6)
+        for along_m in np.arange(4.0, length, 22):
+            self._posts("lamp", at_m=along_m)
+        for along_m in np.arange(2.0, length - 4, 6.2):
+            self._bay(along_m, middle - side * 2.6)
             if rng.random() < 0.6:
-                self._tree(along + 4, -side * rng.uniform(3.8, 5))
+                self._tree(along_m + 4, -side * rng.uniform(3.8, 5))
         self._posts("sign", 3)
 
     def _avenue(self, rng: np.random.Generator, length: float) -> None:
         species = int(rng.integers(0, 10))
-        for along in np.arange(2.0, length, rng.uniform(7, 10)):
+        for along_m in np.arange(2.0, length, rng.uniform(7, 10)):
             for side in (-1, 1):
                 height = rng.uniform(9, 11)
-                self._tree(along, side * rng.uniform(4.2, 4.8), species, height=height)
+                self._tree(along_m, side * rng.uniform(4.2, 4.8), species, height=height)
         for side in (-1, 1):
             self._row(side, (18, 30), 0.35, (6, 15))
         self._posts("bench", 2)
@@ -209,9 +213,9 @@ class Section:
         seed, width, gap = int(rng.integers(0, 1 << 31)), rng.uniform(10, 13), rng.uniform(2, 4)
         size, material = (round(width, 2), 11.0, rng.uniform(7, 11)), MATERIALS[rng.integers(0, len(MATERIALS))]
         for side in (-1, 1):
-            for along in np.arange(1.0, length - width + 2, width + gap):
-                self._build(along, side * 8.5, size, material, seed)
-                self._tree(along + width + gap / 2, side * 5.5, seed % 10, height=6.5)
+            for along_m in np.arange(1.0, length - width + 2, width + gap):
+                self._build(along_m, side * 8.5, size, material, seed)
+                self._tree(along_m + width + gap / 2, side * 5.5, seed % 10, height=6.5)
 
     def _field(self, rng: np.random.Generator, length: float) -> None:
         """Hardly anything: places without a landmark."""
@@ -225,8 +229,8 @@ class Section:
     def _wall(self, rng: np.random.Generator, length: float) -> None:
         side, size = rng.choice([-1, 1]), (length - 1, 0.4, rng.uniform(2.4, 3.4))
         self._build(0.5, side * 4.2, size, "wall", int(rng.integers(0, 1 << 31)), clearance=3.0)
-        for along in np.arange(0.0, length, rng.uniform(8, 14)):
-            self._tree(along, side * rng.uniform(8, 20))
+        for along_m in np.arange(0.0, length, rng.uniform(8, 14)):
+            self._tree(along_m, side * rng.uniform(8, 20))
         for _ in range(3):
             self._tree(rng.uniform(0, length), -side * rng.uniform(14, 50))
 
@@ -234,8 +238,8 @@ class Section:
         side = int(rng.choice([-1, 1]))
         self._pave(0, length, side * 4, side * 24, "asphalt")
         for right, turn in ((6.5, np.pi / 2), (20.5, -np.pi / 2)):
-            for along in np.arange(2.0, length - 2, 2.8):
-                self._bay(along, side * right, turn)
+            for along_m in np.arange(2.0, length - 2, 2.8):
+                self._bay(along_m, side * right, turn)
         self._row(side, (27, 33), 0.8, (6, 15))
         self._row(-side, (7, 12), 0.7, (5, 14))
         for _ in range(6):

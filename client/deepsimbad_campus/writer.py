@@ -32,9 +32,9 @@ def write_campus(
 ) -> list[str]:
     """Render a drive for every season or ISO date (each once) along one route; returns them as sources.
 
-    Pictures go to `<root>/<date>/lb3/Cam5/<utime>.tiff`, 1616 x 1232 as stored (turn them 90 degrees clockwise), what
-    is told of them to `<root>/<date>`, poses to `<root>/ground_truth/groundtruth_<date>.csv`. Equal arguments give
-    equal bytes. A call that was cut short goes on where it stopped; one with more frames adds to those there.
+    Pictures go to `<root>/<date>/lb3/Cam5/<utime>.tiff`, 1616 x 1232 as stored (turn them 90 degrees clockwise), their
+    detections and captions to `<root>/<date>`, poses to `<root>/ground_truth/groundtruth_<date>.csv`. Equal arguments
+    give equal bytes. A call that was cut short goes on where it stopped; one with more frames adds to those there.
 
     Raises:
         CampusError: A season that cannot be; or the folder holds a drive made with other arguments or more frames, or
@@ -63,12 +63,14 @@ def _refuse_another(root: Path, date: str, order: dict[str, float]) -> None:
             raise CampusError(f"{root} holds {date}, but not as a rendered campus: choose another folder")
         return
     try:
-        there = json.loads(file.read_text(encoding="utf-8"))
-        same = {**there, "n_frames": max(there["n_frames"], order["n_frames"])} == order
+        earlier_order = json.loads(file.read_text(encoding="utf-8"))
+        is_same = {**earlier_order, "n_frames": max(earlier_order["n_frames"], order["n_frames"])} == order
     except (ValueError, KeyError, TypeError) as cause:
         raise CampusError(f"{file} is damaged: delete {folder} and render it again") from cause
-    if not same:
-        raise CampusError(f"{folder} was rendered with {there}: ask for that or more frames, or choose another folder")
+    if not is_same:
+        raise CampusError(
+            f"{folder} was rendered with {earlier_order}: ask for that or more frames, or choose another folder"
+        )
 
 
 def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
@@ -78,19 +80,19 @@ def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
         np.savetxt(truth, rows, fmt=["%d", *["%.6f"] * 6], delimiter=",")
     _replace(root / TRUTH_FILE.format(drive.date), truth.getvalue().encode())
     files = [folder / "lb3" / "Cam5" / f"{utime}.tiff" for utime in drive.utime]
-    for left in files[0].parent.glob(".*.part"):  # of a call that was cut short
-        left.unlink(missing_ok=True)
+    for partial_file in files[0].parent.glob(".*.part"):  # of a call that was cut short
+        partial_file.unlink(missing_ok=True)
     missing = [frame for frame, file in enumerate(files) if not file.exists()]
     if missing or not (folder / CAPTIONS).exists():
-        told = Observer(world, drive).files([file.name for file in files])
-        for name, body in zip((DETECTIONS, CAPTIONS), told, strict=True):
+        bodies = Observer(world, drive).files([file.name for file in files])
+        for name, body in zip((DETECTIONS, CAPTIONS), bodies, strict=True):
             _replace(folder / name, body)
     yield from [None] * (len(files) - len(missing))
     if missing:
         renderer = Renderer(world, drive)
 
         def write(frame: int) -> None:
-            _replace(files[frame], cv2.imencode(".tiff", renderer.stored(frame), JPEG_TIFF)[1].tobytes())
+            _replace(files[frame], cv2.imencode(".tiff", renderer.stored_picture(frame), JPEG_TIFF)[1].tobytes())
 
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="campus") as pool:
             yield from pool.map(write, missing)

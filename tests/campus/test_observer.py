@@ -22,25 +22,25 @@ def test_detections_of_two_seasons_are_alike_at_a_place_and_differ_elsewhere(ren
             file.name for file in (rendered / date / "lb3/Cam5").iterdir()
         )
         layouts.append(ObjectLayouts("none").encode([Scene(objects=Objects.read(line["objects"])) for line in lines]))
-    of_a_place = np.einsum("nd,nd->n", *layouts)
-    far = [row @ layouts[1][(place + 18) % 36] for place, row in enumerate(layouts[0])]
-    assert np.median(of_a_place) > np.median(far)
-    assert (of_a_place < 0.999).all()  # misses, false alarms, jitter
+    likeness = np.einsum("nd,nd->n", *layouts)
+    far_likeness = [row @ layouts[1][(place + 18) % 36] for place, row in enumerate(layouts[0])]
+    assert np.median(likeness) > np.median(far_likeness)
+    assert (likeness < 0.999).all()  # misses, false alarms, jitter
 
 
 def test_a_recording_is_seen_as_its_domain_takes_it(rendered):
     recording = open_source(f"nclt:{rendered}/2012-08-04#2:5")
-    told = as_taken(recording, {"objects"})
-    body = told.image(told.frames[0], None)
+    objects = as_taken(recording, {"objects"})
+    body = objects.image(objects.frames[0], None)
     assert body.content_type == "application/json"
     assert json.loads(body.body)["objects"]
     rows = csv.DictReader((rendered / "2012-08-04/captions.csv").read_text().splitlines())
     by_name = {row["name"]: row["text"] for row in rows}
-    words = as_taken(recording, {"text"})
-    assert json.loads(words.image(words.frames[1], None).body) == {"text": by_name[words.frames[1].name]}
+    captions = as_taken(recording, {"text"})
+    assert json.loads(captions.image(captions.frames[1], None).body) == {"text": by_name[captions.frames[1].name]}
     assert as_taken(recording, {"image"}) is recording
-    both = as_taken(recording, {"image", "text"})
-    assert both.image(both.frames[0], (64, 64)).content_type.startswith("multipart/form-data")
+    form = as_taken(recording, {"image", "text"})
+    assert form.image(form.frames[0], (64, 64)).content_type.startswith("multipart/form-data")
 
 
 def test_what_is_not_told_is_named(tmp_path):
@@ -49,9 +49,9 @@ def test_what_is_not_told_is_named(tmp_path):
     with pytest.raises(SourceError, match=r"has no captions\.csv"):
         as_taken(open_source(str(tmp_path)), {"text"})
     (tmp_path / "captions.csv").write_text("name,text\n0.png,a tree\n")
-    told = as_taken(open_source(str(tmp_path)), {"text"})
+    captions = as_taken(open_source(str(tmp_path)), {"text"})
     with pytest.raises(BrokenFrameError, match=r"captions\.csv says nothing of 1\.png"):
-        told.image(told.frames[1], None)
+        captions.image(captions.frames[1], None)
 
 
 @pytest.mark.parametrize(

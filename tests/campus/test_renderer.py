@@ -23,7 +23,7 @@ def renderers():
 
 
 def _upright(renderer, frame):
-    return cv2.rotate(renderer.stored(frame), cv2.ROTATE_90_CLOCKWISE)
+    return cv2.rotate(renderer.stored_picture(frame), cv2.ROTATE_90_CLOCKWISE)
 
 
 def test_only_what_lies_ahead_is_left_of_a_polygon():
@@ -34,7 +34,7 @@ def test_only_what_lies_ahead_is_left_of_a_polygon():
 
 
 def test_pictures_are_stored_turned_counter_clockwise_with_the_sky_up_when_upright(renderers):
-    stored = renderers["summer"].stored(20)
+    stored = renderers["summer"].stored_picture(20)
     assert (stored.shape, stored.dtype) == ((1232, 1616, 3), np.uint8)
     upright = _upright(renderers["summer"], 20).astype(int)
     sky, ground = upright[:200].mean((0, 1)), upright[-300:].mean((0, 1))
@@ -55,7 +55,7 @@ def test_winter_ground_is_whiter_and_summer_trees_are_fuller(renderers):
 
 
 def test_drives_of_one_season_differ_too(renderers):
-    pictures = [renderers[name].stored(5).astype(int) for name in ("summer", "2012-08-20")]
+    pictures = [renderers[name].stored_picture(5).astype(int) for name in ("summer", "2012-08-20")]
     assert np.abs(pictures[0] - pictures[1]).mean() > 4
 
 
@@ -74,8 +74,8 @@ def _wall_on_black(feet):
 def test_a_wall_covers_exactly_its_outline_and_is_not_seen_from_inside(feet):
     camera = View(0, 0, 0).to_camera(np.array(feet, float))
     foot, top = project(camera, 0.0), project(camera, STYLE.height_m)
-    wanted = np.zeros((HEIGHT, WIDTH), np.uint8)
+    expected = np.zeros((HEIGHT, WIDTH), np.uint8)
     outline = np.round(np.array([foot[0], foot[1], top[1], top[0]]) * 16).astype(np.int32)
-    cv2.fillConvexPoly(wanted, outline, 1, cv2.LINE_8, 4)
-    assert (_wall_on_black(feet).any(axis=2) != wanted.astype(bool)).mean() < 0.012  # edges alone
+    cv2.fillConvexPoly(expected, outline, 1, cv2.LINE_8, 4)
+    assert (_wall_on_black(feet).any(axis=2) != expected.astype(bool)).mean() < 0.012  # edges alone
     assert not _wall_on_black(feet[::-1]).any()

@@ -17,14 +17,15 @@ def route():
 
 
 def test_position_is_arc_length_heading_is_the_way_it_goes_and_right_is_to_the_right(route):
-    where = np.arange(0, 780, 0.5)
-    steps = np.diff(route.place(where), axis=0)
+    positions = np.arange(0, 780, 0.5)
+    steps = np.diff(route.place(positions), axis=0)
     np.testing.assert_allclose(np.hypot(*steps.T), 0.5, rtol=2e-3)
-    heading = route.heading(where[:-1] + 0.25)
+    heading = route.heading(positions[:-1] + 0.25)
     assert np.abs((np.arctan2(steps[:, 1], steps[:, 0]) - heading + np.pi) % (2 * np.pi) - np.pi).max() < 0.03
     assert np.ptp(heading) > 0.5  # it bends
-    (here,), (beside,), (angle,) = route.place(where[20:21]), route.place(where[20:21], 2), route.heading(where[20:21])
-    np.testing.assert_allclose(beside - here, [-2 * np.sin(angle), 2 * np.cos(angle)], atol=1e-9)
+    sample = positions[20:21]
+    (place,), (place_right,), (angle,) = route.place(sample), route.place(sample, 2), route.heading(sample)
+    np.testing.assert_allclose(place_right - place, [-2 * np.sin(angle), 2 * np.cos(angle)], atol=1e-9)
 
 
 def test_a_longer_drive_begins_like_a_shorter_one_and_stands_still_at_times(route):
@@ -44,9 +45,9 @@ def test_drives_differ_but_cover_the_same_ground(route):
     winter, summer = Drive(route, 0, WINTER, 401, 1.75), Drive(route, 0, SUMMER, 401, 1.75)
     np.testing.assert_allclose(winter.position_m[::BLOCK], summer.position_m[::BLOCK])
     assert winter.position_m.max() <= drive_length_m(401, 1.75)
-    at = np.arange(10, 600, 5.0)
+    position_m = np.arange(10, 600, 5.0)
     (_, *place, yaw, _, _), (_, *other_place, other_yaw, _, _) = (
-        drive.poses(np.interp(at, drive.position_m, drive.utime)) for drive in (winter, summer)
+        drive.poses(np.interp(position_m, drive.position_m, drive.utime)) for drive in (winter, summer)
     )
     assert 0.2 < np.hypot(*np.subtract(place, other_place)).mean() < 2 * WIDEST_M
     assert 1 < np.rad2deg(np.abs(yaw - other_yaw)).mean() < 14
@@ -75,16 +76,16 @@ def test_ground_truth_is_where_the_pictures_are_taken_with_the_quirks_of_the_rea
         yaw = np.interp(drive.utime[frame], rows[:, 0], np.unwrap(rows[:, 6]))
         assert np.cos(yaw - view.heading_rad) > np.cos(0.02)
     # The robot moves the way it looks, but for a few degrees.
-    moved = rows[500:, 1:3] - rows[:-500, 1:3]
-    far = np.hypot(*moved.T) > 4
-    off = (np.arctan2(moved[:, 1], moved[:, 0]) - rows[250:-250, 6] + np.pi) % (2 * np.pi) - np.pi
-    assert np.rad2deg(np.abs(off[far])).mean() < 8
+    moves = rows[500:, 1:3] - rows[:-500, 1:3]
+    far = np.hypot(*moves.T) > 4
+    turn = (np.arctan2(moves[:, 1], moves[:, 0]) - rows[250:-250, 6] + np.pi) % (2 * np.pi) - np.pi
+    assert np.rad2deg(np.abs(turn[far])).mean() < 8
 
 
 def _things(world, length_m):
     near = [section for section in world.sections if section.stretch.start_m < length_m]
-    placed = [(*thing[0], *thing[1:]) for at in near for thing in (*at.things, *at.bays)]
-    return placed + [(*feet.ravel(), style) for at in near for feet, style in at.facades]
+    things = [(*thing[0], *thing[1:]) for section in near for thing in (*section.things, *section.bays)]
+    return things + [(*feet.ravel(), style) for section in near for feet, style in section.facades]
 
 
 def test_a_longer_world_begins_like_a_shorter_one_and_seeds_make_different_worlds():
@@ -101,7 +102,7 @@ def test_nothing_stands_on_the_route_and_walls_look_outward(seed):
             assert np.hypot(*(line - place).T).min() >= 2.5
         for n, block in enumerate(section.blocks):
             for feet, _ in section.facades[4 * n : 4 * n + 4]:
-                along = feet[1] - feet[0]
+                wall = feet[1] - feet[0]
                 for share in np.linspace(0, 1, 40):
-                    assert np.hypot(*(line - feet[0] - share * along).T).min() >= 2.8
-                assert np.array([-along[1], along[0]]) @ (feet.mean(axis=0) - block.centre) > 0
+                    assert np.hypot(*(line - feet[0] - share * wall).T).min() >= 2.8
+                assert np.array([-wall[1], wall[0]]) @ (feet.mean(axis=0) - block.centre) > 0

@@ -54,36 +54,36 @@ def test_it_goes_on_where_it_was_cut_short_and_adds_frames_to_equal_bytes(campus
             raise RuntimeError("cut short")
 
     write_campus(tmp_path, ["winter"], 4, seed=1)
-    first = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.tiff")}
-    assert len(first) == 4
+    first_times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.tiff")}
+    assert len(first_times) == 4
     with pytest.raises(RuntimeError, match="cut short"):
         write_campus(tmp_path, ["winter"], 12, seed=1, on_progress=stop)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.tiff")}
-    assert 7 <= len(before) < 12
-    assert first.items() <= before.items()
-    (min(before).parent / f".{min(before).name}.part").write_bytes(b"half a pict")
+    earlier_times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.tiff")}
+    assert 7 <= len(earlier_times) < 12
+    assert first_times.items() <= earlier_times.items()
+    (min(earlier_times).parent / f".{min(earlier_times).name}.part").write_bytes(b"half a pict")
     calls = []
     write_campus(tmp_path, ["winter"], 12, seed=1, on_progress=lambda *call: calls.append(call))
     assert calls == [(n_written, 12) for n_written in range(1, 13)]
-    assert all(path.stat().st_mtime_ns == at for path, at in before.items())
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in earlier_times.items())
     assert _files(tmp_path) == {name: body for name, body in _files(campus).items() if WINTER in name}
 
 
 @pytest.mark.parametrize("change", [{"seed": 4}, {"n_frames": 2}, {"spacing_m": 1.0}])
 def test_drives_made_otherwise_are_not_mixed(campus, change):
-    before = _files(campus)
+    earlier_files = _files(campus)
     with pytest.raises(CampusError, match="choose another folder"):
         write_campus(campus, **{"seasons": ["winter"], "n_frames": 12, "seed": 1, **change})
-    assert _files(campus) == before
+    assert _files(campus) == earlier_files
 
 
-@pytest.mark.parametrize("there", [f"{SUMMER}/lb3/Cam5/1344.tiff", f"ground_truth/groundtruth_{SUMMER}.csv"])
-def test_a_real_recording_is_never_touched(tmp_path, there):
-    (tmp_path / there).parent.mkdir(parents=True)
-    (tmp_path / there).write_bytes(b"real")
+@pytest.mark.parametrize("file", [f"{SUMMER}/lb3/Cam5/1344.tiff", f"ground_truth/groundtruth_{SUMMER}.csv"])
+def test_a_real_recording_is_never_touched(tmp_path, file):
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_bytes(b"real")
     with pytest.raises(CampusError, match="not as a rendered campus"):
         write_campus(tmp_path, ["winter", "summer"], 2)
-    assert _files(tmp_path) == {there: b"real"}
+    assert _files(tmp_path) == {file: b"real"}
 
 
 @pytest.mark.parametrize("text", ["[]", "{", '{"seed": 0}'])
