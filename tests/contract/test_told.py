@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepsimbad_client.http import observed
+from deepsimbad_client.http import scene_observation
 
 from .conftest import JPEG, encoded, picture, problem
 
@@ -90,7 +90,7 @@ def test_forms_that_a_domain_does_not_take_are_415(client, objects):
     refused = problem(client.post(seen, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
     assert "image/jpeg" in refused["allowed"]
     problem(client.post(seen, json={"objects": objects_at(0)}), 415, "unsupported_media_type")
-    both = observed({"objects": objects_at(0)}, encoded(picture(1)))
+    both = scene_observation({"objects": objects_at(0)}, encoded(picture(1)))
     problem(client.post(seen, content=both.body, headers=both.headers), 415, "unsupported_media_type")
     problem(client.post(objects, content=both.body[:-10], headers=both.headers), 422, "invalid_scene")
     mixed = client.post(objects, json={"objects": [], "encoding": [1.0]})
@@ -143,7 +143,7 @@ def fused(client):
     for seed, name in enumerate(("landmarks", "drive")):
         client.post("/v1/admin/domains/fused/traverses", json={"name": name})
         for place in range(N):
-            both = observed({"objects": objects_at(place, seed)}, encoded(picture(place)))
+            both = scene_observation({"objects": objects_at(place, seed)}, encoded(picture(place)))
             url = f"/v1/admin/domains/fused/traverses/{name}/frames/{place}?position_m={place}"
             assert client.put(url, content=both.body, headers=both.headers).status_code == 201
     for relevance in ("rrf", "composed"):
@@ -156,7 +156,7 @@ def fused(client):
 
 
 def test_a_fused_view_brings_either_half_or_both(client, fused):
-    both = observed({"objects": objects_at(9, 2)}, encoded(picture(9)))
+    both = scene_observation({"objects": objects_at(9, 2)}, encoded(picture(9)))
     answers = [
         client.post(fused, content=both.body, headers=both.headers),
         client.post(fused, content=encoded(picture(9)), headers=JPEG),
@@ -165,7 +165,7 @@ def test_a_fused_view_brings_either_half_or_both(client, fused):
     assert [answer.json()["informative"] for answer in answers] == [True] * 3
     for answer in answers:
         assert abs(answer.json()["retrieval"][0]["map_image"] - 9) <= 1
-    blank = observed({"objects": []}, encoded(np.full((60, 80, 3), 90, np.uint8)))
+    blank = scene_observation({"objects": []}, encoded(np.full((60, 80, 3), 90, np.uint8)))
     assert client.post(fused, content=blank.body, headers=blank.headers).json()["informative"] is False
 
 

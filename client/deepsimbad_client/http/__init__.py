@@ -1,4 +1,4 @@
-"""What one request of the contract says, and how its answer is read; nothing here sends."""
+"""The requests of the contract and the reading of their answers; nothing here sends."""
 
 import hashlib
 import json
@@ -74,7 +74,7 @@ class Repeat(Enum):
 
 @dataclass(frozen=True)
 class Call:
-    """One request; absent (None) values of `params` are left out, and floats keep every digit; names are repeated."""
+    """One request: of `params`, None is left out, floats keep every digit, a sequence repeats its name."""
 
     method: str
     path: str  # below the server's address, already quoted
@@ -82,29 +82,29 @@ class Call:
     headers: Mapping[str, str] = field(default_factory=dict)
     body: bytes | None = None
     repeat: Repeat = Repeat.ALWAYS
-    gone_is_done: bool = False  # a 404 or 410 after a try whose answer was lost means that try did it (deletes)
+    gone_is_done: bool = False  # a 404 or 410 after a try whose answer was lost means that this try did it (deletes)
 
     def __str__(self) -> str:
         return f"{self.method} {self.path}"
 
     @classmethod
-    def with_json(cls, method: str, path: str, document: Mapping[str, Any], **more: Any) -> "Call":
-        """A call whose body is a document, absent (None) values left out; raises InvalidArgumentError for NaN."""
+    def with_json(cls, method: str, path: str, document: Mapping[str, Any], **fields: Any) -> "Call":
+        """A call whose body is a document without its None values; raises InvalidArgumentError for NaN."""
         try:
             body = json_of({key: value for key, value in document.items() if value is not None})
         except (TypeError, ValueError) as error:
             raise InvalidArgumentError(f"cannot be sent as JSON: {error}") from error
-        more["headers"] = {"Content-Type": "application/json", **more.get("headers", {})}
-        return cls(method, path, body=body.encode(), **more)
+        fields["headers"] = {"Content-Type": "application/json", **fields.get("headers", {})}
+        return cls(method, path, body=body.encode(), **fields)
 
     @classmethod
     def delete(cls, path: str) -> "Call":
-        """A call that deletes, and is done where nothing is left to delete after its answer was lost."""
+        """A call that deletes; if its answer was lost, finding nothing left to delete counts as success."""
         return cls("DELETE", path, gone_is_done=True)
 
 
-def once(idempotency_key: str | None) -> dict[str, str]:
-    """The header by which a request acts once however often it is sent; absent: a new key."""
+def idempotency_header(idempotency_key: str | None) -> dict[str, str]:
+    """The header by which a request acts once however often it is sent; None: a new key is drawn."""
     return {"Idempotency-Key": idempotency_key or uuid4().hex}
 
 
@@ -118,12 +118,12 @@ def in_path(kind: str, name: str) -> str:
 
 
 def domain_path(name: str) -> str:
-    """Where the calls of a robot in a domain begin."""
+    """The path that a robot's calls in a domain begin with; raises InvalidArgumentError."""
     return f"/v1/domains/{in_path('domain', name)}"
 
 
 def session_path(session_id: str) -> str:
-    """Where the calls of a session begin."""
+    """The path that a session's calls begin with; raises InvalidArgumentError."""
     return f"/v1/sessions/{in_path('session', session_id)}"
 
 
@@ -133,17 +133,17 @@ class Observation:
 
     body: bytes
     content_type: str
-    landmark_model: str | None = None  # digest of what it was made by on board, which the answering map must have
+    landmark_model: str | None = None  # digest of the model it was made with on board; the answering map must match
 
     @property
     def headers(self) -> dict[str, str]:
-        """What a request says of it."""
+        """The request headers: the content type, and the landmark model that must match."""
         matching = {} if self.landmark_model is None else {"If-Match": f'"{self.landmark_model}"'}
         return {"Content-Type": self.content_type, **matching}
 
 
 class ViewForm(TypedDict, total=False):
-    """The forms of a view beside an image, of which exactly one is given."""
+    """The forms of a view other than an image; exactly one is given."""
 
     content_type: str | None  # the image's media type; absent: read from its first bytes
     ranked_landmarks: Numbers | None  # landmark ids, nearest first, 1..r of them
@@ -155,7 +155,7 @@ class ViewForm(TypedDict, total=False):
 
 
 def media_type_of(body: bytes) -> str | None:
-    """The media type an image's first bytes show, or None for a format the service does not take."""
+    """The media type that an image's first bytes show; None for a format the service does not take."""
     return next((kind for kind, pattern in _SIGNATURES.items() if re.match(pattern, body)), None)
 
 
@@ -163,9 +163,9 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
     """Make the body of one observation; raises InvalidArgumentError, BrokenFrameError (the file cannot be read)."""
     content_type = view.pop("content_type", None)
     forms = {name: form for name, form in view.items() if form is not None}
-    told: dict[str, Any] = {name: forms[name] for name in ("objects", "text") if name in forms}
-    if told and len(told) == len(forms):
-        return observed(told, None if image is None else image_bytes(image))
+    scene: dict[str, Any] = {name: forms[name] for name in ("objects", "text") if name in forms}
+    if scene and len(scene) == len(forms):
+        return scene_observation(scene, None if image is None else image_bytes(image))
     if len(forms) + (image is not None) != 1:
         raise InvalidArgumentError(
             "give exactly one of image, on_board, ranked_landmarks, dissimilarities and encoding; or objects and text, "
@@ -175,8 +175,8 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
         body = image_bytes(image)
         media_type = content_type or media_type_of(body)
         if media_type is None:
-            what = "the file" if isinstance(image, str | PathLike) or hasattr(image, "read") else "the bytes"
-            raise InvalidArgumentError(f"{what} given as image is not a JPEG, PNG, TIFF or WebP")
+            source = "the file" if isinstance(image, str | PathLike) or hasattr(image, "read") else "the bytes"
+            raise InvalidArgumentError(f"{source} given as image is not a JPEG, PNG, TIFF or WebP")
         return Observation(body, media_type)
     ((name, form),) = forms.items()
     if isinstance(form, Observation):
@@ -188,13 +188,13 @@ def observation(image: Image | None = None, **view: Unpack[ViewForm]) -> Observa
     return Observation(text.encode(), "application/json")
 
 
-def observed(told: Mapping[str, Any], image: bytes | None = None) -> Observation:
-    """The body of a view that is told by objects, a text, or both; a form where an image goes with it."""
+def scene_observation(scene: Mapping[str, Any], image: bytes | None = None) -> Observation:
+    """The body of a view given as objects, a text, or both: JSON, or a multipart form where an image goes with it."""
     try:
-        told = {name: value if isinstance(value, str) else list(value) for name, value in told.items()}
+        scene = {name: value if isinstance(value, str) else list(value) for name, value in scene.items()}
         if image is None:
-            return Observation(json_of(told).encode(), "application/json")
-        parts = {name: value if isinstance(value, str) else json_of(value) for name, value in told.items()}
+            return Observation(json_of(scene).encode(), "application/json")
+        parts = {name: value if isinstance(value, str) else json_of(value) for name, value in scene.items()}
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(f"objects and text must be plain JSON: {error}") from error
     content = {"image": image, **{name: value.encode() for name, value in parts.items()}}
@@ -207,7 +207,10 @@ def observed(told: Mapping[str, Any], image: bytes | None = None) -> Observation
 
 
 def image_bytes(image: Image) -> bytes:
-    """An encoded image's bytes, a file's, or pixels as PNG; raises InvalidArgumentError, BrokenFrameError."""
+    """The encoded image: bytes as they are, a file's content, pixels as PNG.
+
+    Raises InvalidArgumentError, BrokenFrameError (the file cannot be read).
+    """
     content: Any = image
     try:
         if isinstance(image, str | PathLike):
@@ -219,14 +222,16 @@ def image_bytes(image: Image) -> bytes:
     if isinstance(content, bytes | bytearray | memoryview):
         return bytes(content)
     if not hasattr(content, "dtype"):
-        what = f"image is {type(image).__name__}" + (" that reads text" if isinstance(content, str) else "")
+        image_type = type(image).__name__ + (" that reads text" if isinstance(content, str) else "")
         raise InvalidArgumentError(
-            f"{what}: give encoded bytes, a path, a file opened as binary, or an array of pixels"
+            f"image is {image_type}: give encoded bytes, a path, a file opened as binary, or an array of pixels"
         )
     has_pixels = content.ndim in {2, 3} and content.shape[2:] in {(), (3,)} and content.size
     if not has_pixels or str(content.dtype) != "uint8":
-        shown = f"{list(content.shape)} {content.dtype}"
-        raise InvalidArgumentError(f"image is {shown}: pixels are [height, width, 3] BGR or [height, width], uint8")
+        raise InvalidArgumentError(
+            f"image is {list(content.shape)} {content.dtype}: "
+            "pixels are [height, width, 3] BGR or [height, width], uint8"
+        )
     try:
         import cv2  # noqa: PLC0415 - the client alone must work without it
     except ImportError as error:
@@ -235,28 +240,28 @@ def image_bytes(image: Image) -> bytes:
 
 
 def text_of(name: str) -> str:
-    """A frame's name as the service takes it: what is no character, or controls a terminal, becomes U+FFFD."""
+    """A frame's name as the service takes it: cut, with control characters and lone surrogates as U+FFFD."""
     return _NO_CHARACTER.sub("\ufffd", name)[:MAX_NAME_LENGTH]
 
 
 def known_positions(true_positions_m: Numbers) -> list[float | None]:
-    """Positions as JSON takes them: NaN becomes None."""
+    """Positions as a list for JSON: NaN becomes None."""
     return [None if isinstance(value, float) and math.isnan(value) else value for value in _plain(true_positions_m)]
 
 
 def json_of(value: Any) -> str:
-    """JSON in few bytes, numpy's numbers as Python's; raises TypeError or ValueError for what it cannot say, as NaN."""
+    """Compact JSON, numpy's numbers as Python's; raises TypeError or ValueError for what JSON lacks, such as NaN."""
 
-    def known(strange: Any) -> Any:
-        if (plain := of_python(strange)) is strange:
-            raise TypeError(f"{type(strange).__name__} is no number")
+    def plain_number(number: Any) -> Any:
+        if (plain := of_python(number)) is number:
+            raise TypeError(f"{type(number).__name__} is no number")
         return plain
 
-    return json.dumps(value, allow_nan=False, separators=(",", ":"), default=known)
+    return json.dumps(value, allow_nan=False, separators=(",", ":"), default=plain_number)
 
 
 def of_python(value: Any) -> Any:
-    """A number or an array of numpy's as Python has it; all else as it is."""
+    """A numpy number or array as Python's number or list; all else as it is."""
     return value.tolist() if hasattr(value, "tolist") else value
 
 
@@ -265,7 +270,7 @@ def _plain(values: Any) -> list[Any]:
 
 
 def problem_of(response: httpx2.Response) -> dict[str, Any]:
-    """The problem document (RFC 9457) of an error answer; empty where it holds none, as a proxy's own page."""
+    """The problem document (RFC 9457) of an error answer; empty where it holds none, such as a proxy's own page."""
     try:
         document = json.loads(response.content)
     except ValueError:
@@ -273,8 +278,8 @@ def problem_of(response: httpx2.Response) -> dict[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-def retry_after_s(header: str | None, now: datetime | None = None) -> float | None:
-    """Seconds that a `Retry-After` header asks for (seconds or an HTTP date); None when it says nothing usable."""
+def retry_after_s(header: str | None, moment: datetime | None = None) -> float | None:
+    """Seconds from `moment` (None: now) that a `Retry-After` header asks for, as seconds or a date; None: unusable."""
     header = (header or "").strip()
     if header.isascii() and header.isdigit():
         return float(header)
@@ -283,7 +288,7 @@ def retry_after_s(header: str | None, now: datetime | None = None) -> float | No
     except ValueError:
         return None
     date = date if date.tzinfo else date.replace(tzinfo=UTC)
-    return max(0.0, (date - (now or datetime.now(UTC))).total_seconds())
+    return max(0.0, (date - (moment or datetime.now(UTC))).total_seconds())
 
 
 def raise_for_problem(response: httpx2.Response) -> None:
@@ -300,9 +305,9 @@ def raise_for_problem(response: httpx2.Response) -> None:
     code = str(problem.get("code") or "")
     detail = problem.get("detail") or problem.get("title")
     request_id = response.headers.get(REQUEST_ID) or problem.get("request_id")
-    answered = f"{response.request.url} answered {status} {response.reason_phrase}".rstrip()
+    status_line = f"{response.request.url} answered {status} {response.reason_phrase}".rstrip()
     raise api_error_class(status, code)(
-        str(detail or f"{answered}, and no reason as this service gives: is the address right?"),
+        str(detail or f"{status_line}, and no reason as this service gives: is the address right?"),
         status=status,
         code=code,
         problem=problem,
@@ -320,24 +325,24 @@ def model_of(kind: type[Model], response: httpx2.Response) -> Model:
 
 
 def page_of(kind: type[Model], key: str, response: httpx2.Response) -> tuple[tuple[Model, ...], str | None]:
-    """One page of a list, bare or under `key`, and what the next is asked for by (None: the list ends).
+    """One page of a list, bare or under `key`, and the cursor of the next page (None: the list ends).
 
     Raises UnexpectedAnswerError.
     """
     adapter: TypeAdapter[tuple[Model, ...]] = TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
     try:
         document = json.loads(response.content)
-        following = document.get("next") if isinstance(document, dict) else None
+        cursor = document.get("next") if isinstance(document, dict) else None
         models = adapter.validate_python(document[key] if isinstance(document, dict) else document)
     except (ValueError, KeyError) as error:
         raise _unexpected(response, error) from error
     request_id = response.headers.get(REQUEST_ID)
-    return tuple(model.answering(request_id) for model in models), None if following is None else str(following)
+    return tuple(model.answering(request_id) for model in models), None if cursor is None else str(cursor)
 
 
 def float_array(response: httpx2.Response) -> "NDArray[np.float32]":
     """The [n] float32 of an npy body; raises MissingExtraError, UnexpectedAnswerError."""
-    values = _loaded(response)
+    values = _arrays_of(response)
     if values.ndim != 1:
         raise _unexpected(response, ValueError(f"an array of shape {values.shape}"))
     floats: NDArray[np.float32] = values.astype("<f4", copy=False)
@@ -346,11 +351,11 @@ def float_array(response: httpx2.Response) -> "NDArray[np.float32]":
 
 def named_arrays(response: httpx2.Response) -> "dict[str, NDArray[Any]]":
     """The arrays of an npz body; raises MissingExtraError, UnexpectedAnswerError."""
-    with _loaded(response) as arrays:
+    with _arrays_of(response) as arrays:
         return dict(arrays)
 
 
-def _loaded(response: httpx2.Response) -> Any:
+def _arrays_of(response: httpx2.Response) -> Any:
     try:
         return require_numpy().load(BytesIO(response.content), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
@@ -358,7 +363,7 @@ def _loaded(response: httpx2.Response) -> Any:
 
 
 def require_numpy() -> Any:
-    """Import numpy where a call cannot do without; raises MissingExtraError."""
+    """Import numpy for a call that needs it; raises MissingExtraError."""
     try:
         import numpy as np  # noqa: PLC0415 - the client alone must work without it
     except ImportError as error:

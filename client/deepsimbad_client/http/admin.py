@@ -1,4 +1,4 @@
-"""What an administrator asks for, on the blocking and the async client: domains, traverses, jobs, maps, sessions."""
+"""An administrator's calls for domains, traverses, jobs, maps and sessions, on the blocking and the async client."""
 
 import time
 from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
@@ -24,11 +24,11 @@ from deepsimbad_client.http import (
     Image,
     Numbers,
     Repeat,
+    idempotency_header,
     in_path,
     known_positions,
     named_arrays,
     observation,
-    once,
     require_numpy,
     session_path,
     text_of,
@@ -49,7 +49,7 @@ _JOBS = "/v1/admin/jobs"
 
 
 class RemapOptions(TypedDict, total=False):
-    """What a remap may be told; what is absent or None is left to the service's default."""
+    """The options of a remap; one that is absent or None is left to the service's default."""
 
     landmark_traverse: str | None  # where landmarks are chosen; absent: the active map's, or the new map's own drive
     n_landmarks: int | None  # r
@@ -101,8 +101,8 @@ class AdminCalls(Face):
     async def create_traverse(self, domain: str, name: str, *, grey_levels: tuple[int, int] | None = None) -> Traverse:
         """Make an empty traverse; one of that name that is there stays as it is.
 
-        `grey_levels` are what is shown black and what white of pictures of more than 8 bits; absent: by the first one.
-        A traverse that has some keeps them.
+        `grey_levels` are the levels shown as black and as white in pictures of more than 8 bits; absent: by the first
+        picture. A traverse that has some keeps them.
         """
         in_path("traverse", name)
         call = Call.with_json("POST", f"{_domain(domain)}/traverses", {"name": name, "grey_levels": grey_levels})
@@ -152,7 +152,7 @@ class AdminCalls(Face):
         view = observation(image, content_type=content_type, encoding=encoding, objects=objects, text=text)
         place: dict[str, float | str | None] = {"position_m": position_m, "timestamp_us": timestamp_us}
         place |= {"x_m": x_m, "y_m": y_m, "name": None if name is None else text_of(name)}
-        place |= {"camera": None if camera is None else text_of(camera), **_keeping(replace)}
+        place |= {"camera": None if camera is None else text_of(camera), **_replace_param(replace)}
         call = Call("PUT", f"{_traverse(domain, traverse)}/frames/{int(index)}", place, view.headers, view.body)
         return await self._wire.model(FrameStored, call)
 
@@ -188,12 +188,14 @@ class AdminCalls(Face):
         packed = BytesIO()
         np.savez(packed, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
         headers = {"Content-Type": "application/octet-stream"}
-        call = Call("POST", f"{_traverse(domain, traverse)}/frames", _keeping(replace), headers, packed.getvalue())
+        call = Call(
+            "POST", f"{_traverse(domain, traverse)}/frames", _replace_param(replace), headers, packed.getvalue()
+        )
         return await self._wire.model(FramesStored, call)
 
     @shared
     async def frames(self, domain: str, traverse: str) -> "dict[str, NDArray[Any]]":
-        """What is there, without encodings: `index`, and the arrays [n] that `deepsimbad.core.frames` names."""
+        """The stored frames without encodings: `index`, and the arrays [n] that `deepsimbad.core.frames` names."""
         call = Call("GET", f"{_traverse(domain, traverse)}/frames", headers=BINARY)
         return named_arrays(await self._wire.send(call))
 
@@ -213,7 +215,9 @@ class AdminCalls(Face):
         can be repeated after a `TransportError`; absent: a new one.
         """
         document = {"training_traverse": training_traverse, **options}
-        call = Call.with_json("POST", f"{_domain(domain)}/remaps", document, headers=once(idempotency_key))
+        call = Call.with_json(
+            "POST", f"{_domain(domain)}/remaps", document, headers=idempotency_header(idempotency_key)
+        )
         return await self._wire.model(Job, call)
 
     @shared
@@ -226,7 +230,9 @@ class AdminCalls(Face):
         each observation, in order, is None or NaN where unknown; the key is as that of `remap`.
         """
         document = {"session_id": session_id, "true_positions_m": known_positions(true_positions_m)}
-        call = Call.with_json("POST", f"{_domain(domain)}/experience", document, headers=once(idempotency_key))
+        call = Call.with_json(
+            "POST", f"{_domain(domain)}/experience", document, headers=idempotency_header(idempotency_key)
+        )
         return await self._wire.model(Job, call)
 
     @shared
@@ -241,14 +247,14 @@ class AdminCalls(Face):
 
     @shared_stream
     async def job_events(self, job_id: str) -> AsyncGenerator[Job, None]:
-        """Yield the job each time it has moved, the last time ended; one connection, not renewed when it breaks.
+        """Yield the job each time it has changed, until it has ended, over one connection that is not renewed.
 
         Raises TransportError (the connection failed or broke off).
         """
         call = Call("GET", f"{_job(job_id)}/events", headers={"Accept": "text/event-stream"}, repeat=Repeat.NEVER)
         async with aclosing(self._wire.events(call)) as events:
             async for event in events:
-                with suppress(ValidationError):  # an event may hold no job
+                with suppress(ValidationError):  # of an event that holds no job
                     yield Job.model_validate_json(event.data)
                 if event.event == "done":
                     return
@@ -265,12 +271,12 @@ class AdminCalls(Face):
 
     @shared
     async def warm(self, domain: str) -> None:
-        """Say that a domain will soon be asked: its map is loaded meanwhile. Raises NoActiveMapError."""
+        """Let the service load a domain's map, which will soon be asked for. Raises NoActiveMapError."""
         await self._wire.send(Call("POST", f"{_domain(domain)}/warm"))
 
     @shared
     async def activate(self, domain: str, version: int, *, expected: int | None = None) -> MapVersion:
-        """Serve another version, forward or back, if `expected` (absent: whichever) is the active one now.
+        """Serve another version, newer or older, if `expected` (absent: whichever) is the active one now.
 
         Raises LostActivationError (another one was active), RetiredMapError (the version's file was removed).
         """
@@ -285,7 +291,7 @@ class AdminCalls(Face):
 
     @shared
     async def rollback(self, domain: str) -> MapVersion:
-        """Serve the version again that served before the active one; once more, and the present one is back.
+        """Serve again the version that served before the active one; called twice, it restores the present one.
 
         Raises NoEarlierMapError, LostActivationError (another version was activated meanwhile).
         """
@@ -304,7 +310,7 @@ class AdminCalls(Face):
 
     @shared
     async def delete_map(self, domain: str, version: int) -> None:
-        """Remove the file of a version; its place in the history stays.."""
+        """Remove the file of a version; its place in the history stays."""
         await self._wire.send(Call.delete(f"{_domain(domain)}/maps/{int(version)}"))
 
     @shared
@@ -317,7 +323,7 @@ class AdminCalls(Face):
         that was interrupted goes on where it stopped, this time or the next. Raises RetiredMapError,
         DamagedDownloadError, NotSavedError.
         """
-        # As its bytes are: compressed on the way, its parts could not be put together.
+        # Not compressed on the way: the parts of compressed bytes could not be put together.
         headers = {"Accept": "application/vnd.sqlite3, application/octet-stream", "Accept-Encoding": "identity"}
         call = Call("GET", f"{_domain(domain)}/maps/{int(version)}/file", headers=headers)
         try:
@@ -332,7 +338,7 @@ class AdminCalls(Face):
 
     @shared
     async def delete_session(self, session_id: str) -> None:
-        """End a session, whoever began it."""
+        """End a session, whichever key began it."""
         await self._wire.send(Call.delete(session_path(session_id)))
 
 
@@ -352,7 +358,7 @@ def _traverse(domain: str, name: str) -> str:
     return f"{_domain(domain)}/traverses/{in_path('traverse', name)}"
 
 
-def _keeping(replace: bool) -> dict[str, str]:
+def _replace_param(replace: bool) -> dict[str, str]:
     return {} if replace else {"replace": "false"}
 
 
@@ -369,7 +375,7 @@ def remap(
     patience_s: float = PATIENCE_S,
     **options: Unpack[RemapOptions],
 ) -> Job:
-    """Make a new map of `training_traverse` and what `RemapOptions` names, and follow its job to its end.
+    """Make a new map of `training_traverse` by the `RemapOptions`, and follow its job to its end.
 
     The `result` of the job holds `map_version`, `active` and `metrics`. Where the new map lost against the active one
     by more than the gate's margin, `active` is false and `check["why"]` says so. The rest is as in `follow_job`.
@@ -393,16 +399,16 @@ def follow_job(
     """Follow a job until it has succeeded, through lost connections and restarted services.
 
     Listens to its event stream; where that breaks off, asks for the job now and then until the service answers again
-    and listens anew; where there is no stream at all, goes on asking. `on_progress` is told of the job each time
-    something is heard of it, `on_silence` the seconds since then each time the service has not answered; longer than
-    `patience_s` it is not waited for. Raises JobFailedError, JobCancelledError, TransportError (nothing was heard for
-    `patience_s`; the job itself may go on), ApiError.
+    and listens anew; where there is no stream at all, goes on asking. `on_progress` is called with the job each time it
+    is heard of, `on_silence` with the seconds since then each time the service has not answered. Raises JobFailedError,
+    JobCancelledError, TransportError (nothing was heard for `patience_s`; the job itself may go on), ApiError.
     """
-    last_heard, wait_s, streams = clock(), POLL_S, True
+    last_heard_s, wait_s, has_stream = clock(), POLL_S, True
 
-    def ended(job: Job) -> bool:
-        nonlocal last_heard, wait_s
-        last_heard, wait_s = clock(), POLL_S
+    def hear(job: Job) -> bool:
+        """Report a job just heard of, and return whether it succeeded."""
+        nonlocal last_heard_s, wait_s
+        last_heard_s, wait_s = clock(), POLL_S
         if on_progress is not None:
             on_progress(job)
         if job.state == "cancelled":
@@ -413,27 +419,27 @@ def follow_job(
 
     while True:
         try:
-            for job in client.admin.job_events(job_id) if streams else ():
-                if ended(job):
+            for job in client.admin.job_events(job_id) if has_stream else ():
+                if hear(job):
                     return job
         except TransportError:
             pass
         except ApiError as error:
-            streams = _passes(error)
+            has_stream = _is_passing(error)
         try:
             job = client.admin.job(job_id)
         except (TransportError, ApiError) as error:
-            if not _passes(error) or clock() - last_heard > patience_s:
+            if not _is_passing(error) or clock() - last_heard_s > patience_s:
                 raise
             if on_silence is not None:
-                on_silence(clock() - last_heard)
+                on_silence(clock() - last_heard_s)
             wait_s = min(2 * wait_s, LONGEST_POLL_S)
         else:
-            if ended(job):
+            if hear(job):
                 return job
         sleep(wait_s)
 
 
-def _passes(error: TransportError | ApiError) -> bool:
+def _is_passing(error: TransportError | ApiError) -> bool:
     """Whether the service may answer again later."""
     return isinstance(error, TransportError) or error.status >= 500 or error.status in RETRIED_STATUSES

@@ -1,4 +1,4 @@
-"""What a robot asks for: domains, places and sessions, on the blocking and the async client."""
+"""A robot's calls for domains, places and sessions, on the blocking and the async client."""
 
 import asyncio
 import math
@@ -20,10 +20,10 @@ from deepsimbad_client.http import (
     ViewForm,
     domain_path,
     float_array,
+    idempotency_header,
     known_positions,
     model_of,
     observation,
-    once,
     session_path,
 )
 from deepsimbad_client.http.admin import Admin, AsyncAdmin
@@ -48,10 +48,10 @@ from deepsimbad_client.http.wire import (
     Face,
     RetryPolicy,
     Wire,
-    finished,
+    http_settings,
+    run_to_end,
     shared,
     shared_stream,
-    speaking_to,
 )
 
 if TYPE_CHECKING:
@@ -64,18 +64,18 @@ AnySession = TypeVar("AnySession", bound="SessionCalls")
 
 
 class SessionCalls(Face):
-    """The calls of a session: `opened` is what the service said of it, `keep` whether it outlives its `with` block."""
+    """The calls of a session: `opened` is its state when it was opened, `keep` whether it outlives its `with` block."""
 
-    def __init__(self, wire: Wire, opened: SessionState, *, keep: bool) -> None:
+    def __init__(self, wire: Wire, state: SessionState, *, keep: bool) -> None:
         super().__init__(wire)
-        self.opened = opened
+        self.opened = state
         self.keep = keep
-        self._path = session_path(opened.session_id)
+        self._path = session_path(state.session_id)
         self._deleted = False
 
     @property
     def session_id(self) -> str:
-        """By which `Client.attach_session` finds the session again, from this process or another."""
+        """The id by which `Client.attach_session` finds the session again, from this process or another."""
         return self.opened.session_id
 
     @property
@@ -85,7 +85,7 @@ class SessionCalls(Face):
 
     @property
     def map_version(self) -> int:
-        """The map that the session began on and keeps, whatever is activated later."""
+        """The version of the map that the session began on and keeps, whatever is activated later."""
         return self.opened.map_version
 
     @shared
@@ -99,7 +99,7 @@ class SessionCalls(Face):
         idempotency_key: str | None = None,
         **view: Unpack[ViewForm],
     ) -> SessionAnswer:
-        """Tell what the robot sees now, after the metres it has moved; give exactly one form of the view.
+        """Send what the robot sees now, after the metres it has moved; give exactly one form of the view.
 
         The forms of a view and `shortlist` are those of `Client.localize`. `action_m` are the metres really
         moved since the last view (absent: stood still; ignored for the first view), `action_std_m` how well
@@ -108,23 +108,23 @@ class SessionCalls(Face):
         same again under it. Raises InvalidMoveError, LandmarkModelDiffersError, InvalidInputError, GoneError.
         """
         body = observation(image, **view)
-        moved = {"action_m": action_m, "action_std_m": action_std_m}
-        for name, value in moved.items():
+        move = {"action_m": action_m, "action_std_m": action_std_m}
+        for name, value in move.items():
             if value is not None and not math.isfinite(value):
                 raise InvalidArgumentError(f"{name} is {value}: give metres, or nothing when the robot stood still")
         call = Call(
             "POST",
             f"{self._path}/observations",
-            params={name: None if value is None else float(value) for name, value in moved.items()}
+            params={name: None if value is None else float(value) for name, value in move.items()}
             | {"shortlist": shortlist},
-            headers=body.headers | once(idempotency_key),
+            headers=body.headers | idempotency_header(idempotency_key),
             body=body.body,
         )
         return await self._wire.model(SessionAnswer, call)
 
     @shared
     async def state(self) -> SessionState:
-        """What it believes now, and how many views that rests on."""
+        """The session's present belief, and how many views it rests on."""
         return await self._wire.model(SessionState, Call("GET", self._path))
 
     @shared
@@ -134,16 +134,16 @@ class SessionCalls(Face):
 
     @shared
     async def next_best_view(self) -> NextBestView | None:
-        """The move that would tell most, without another view; None where the map can name none."""
+        """The most informative next move, without sending another view; None where the map can name none."""
         response = await self._wire.send(Call("GET", f"{self._path}/next-best-view"))
         return None if response.content.strip() == b"null" else model_of(NextBestView, response)
 
     @shared_stream
     async def events(self, after: int | None = None) -> AsyncGenerator[SessionAnswer, None]:
-        """Yield what every observation is answered, until the session ends; one connection, not renewed when it breaks.
+        """Yield the answer to every observation until the session ends, over one connection that is not renewed.
 
-        Begins with the last answer that there was, or behind event `after`; 0: with the first. Raises
-        TransportError (the connection failed or broke off).
+        Begins with the latest answer, or behind event `after`; 0: with the first. Raises TransportError (the
+        connection failed or broke off).
         """
         call = Call(
             "GET", f"{self._path}/events", {"after": after}, {"Accept": "text/event-stream"}, repeat=Repeat.NEVER
@@ -157,12 +157,12 @@ class SessionCalls(Face):
 
     @shared
     async def view(self) -> bytes | None:
-        """What the robot saw last, as a small JPEG; None where the service holds it no more."""
+        """The robot's last view as a small JPEG; None where the service no longer holds it."""
         return (await self._wire.send(Call("GET", f"{self._path}/view"))).content or None
 
     @shared
     async def set_prior(self, position_m: float, std_m: float) -> SessionState:
-        """Forget the belief for one around a position: the robot was carried, or got a fix.
+        """Replace the belief by one around a position: the robot was carried, or got a fix.
 
         Raises InvalidPriorError (the position is far off the route, or the deviation cannot be one).
         """
@@ -182,15 +182,14 @@ class SessionCalls(Face):
         The service raises its alarm by this; the map learns nothing from it (`Admin.feed_experience`). The same truths
         again count once.
 
-        A position along the map's route for each observation, in order, is None where unknown.
+        `true_positions_m` are positions along the map's route, one for each observation in order, None where unknown.
         `true_map_images` are, for each of the same observations, the map images that show its place: the
         answer's `retrieval_ranks` then tell where each view by itself placed the best of them. Truths may be
-        told bit by bit, from `first_observation` on. Raises InvalidInputError (as many positions as
-        observations there are not).
+        sent bit by bit, from `first_observation` on. Raises InvalidInputError (not one position per observation).
         """
         images = None if true_map_images is None else [[int(image) for image in images] for images in true_map_images]
-        more = {"true_map_images": images, "first_observation": first_observation or None}
-        return await _truths(self._wire, self._path, true_positions_m, **more)
+        fields = {"true_map_images": images, "first_observation": first_observation or None}
+        return await _truths(self._wire, self._path, true_positions_m, **fields)
 
     @shared
     async def delete(self) -> None:
@@ -239,12 +238,12 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def ready(self) -> Health:
-        """Whether it can answer now; asked once. Raises UnavailableError: not yet; its detail says why."""
+        """Whether the service can answer now; asked once. Raises UnavailableError (not yet; its detail says why)."""
         return await self._wire.model(Health, Call("GET", "/readyz", repeat=Repeat.NEVER))
 
     @shared
     async def metrics(self) -> str:
-        """What the service counts, in Prometheus' text format."""
+        """The service's metrics in Prometheus' text format."""
         return (await self._wire.send(Call("GET", "/metrics"))).text
 
     @shared
@@ -277,7 +276,7 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def landmarks(self, domain: str, *, map_version: int | None = None) -> Landmarks:
-        """What a map's landmarks began as. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
+        """The frames that a map's landmarks began as. Raises UnknownDomainError, NoActiveMapError, RetiredMapError."""
         call = Call("GET", f"{domain_path(domain)}/landmarks", {"map_version": map_version})
         return await self._wire.model(Landmarks, call)
 
@@ -327,8 +326,8 @@ class ClientCalls(Face, Generic[AnySession]):
     ) -> Whereabouts:
         """On which of many domains one view is, and where on them; the forms of a view are those of `localize`.
 
-        `domains` are asked (absent: all that the key opens), each as probable before as every other; `in_full` is how
-        many of the likeliest are told with their beliefs. Raises UnknownDomainError, ForbiddenError, InvalidInputError,
+        `domains` are asked (absent: all that the key opens), all equally probable beforehand; `in_full` is how many of
+        the likeliest are answered with their beliefs. Raises UnknownDomainError, ForbiddenError, InvalidInputError,
         LandmarkModelDiffersError (ranks and dissimilarities are of one landmark model), ConflictError (none answers).
         """
         body = observation(image, **view)
@@ -386,12 +385,14 @@ class ClientCalls(Face, Generic[AnySession]):
             "confidence": confidence,
             "price_bits_per_m": price_bits_per_m,
         }
-        call = Call.with_json("POST", f"{domain_path(domain)}/sessions", document, headers=once(idempotency_key))
+        call = Call.with_json(
+            "POST", f"{domain_path(domain)}/sessions", document, headers=idempotency_header(idempotency_key)
+        )
         return self._session(self._wire, await self._wire.model(SessionState, call), keep=keep)
 
     @shared
     async def attach_session(self, session_id: str, *, keep: bool = True) -> AnySession:
-        """Find a session again that was kept. Raises UnknownSessionError, EndedSessionError, RetiredMapError."""
+        """Go on with a session that was kept. Raises UnknownSessionError, EndedSessionError, RetiredMapError."""
         response = await self._wire.send(Call("GET", session_path(session_id)))
         return self._session(self._wire, model_of(SessionState, response), keep=keep)
 
@@ -420,7 +421,7 @@ class Client(ClientCalls[Session], Blocking):
         timeout: Connect, read, write and pool timeouts in seconds.
         retry: How often and how long to try.
         request_id: Names every request that is sent, each try anew, in the service's log too: 1 to 64 letters, digits,
-            '.', '_' and '-'; absent: the service names them. Answers and errors tell it as their `request_id`.
+            '.', '_' and '-'; absent: the service names them. Answers and errors hold it as their `request_id`.
         transport: Another httpx2 transport (tests, proxies, Unix sockets).
         sleep: Waits between tries.
         jitter: Draws in 0..1 that spread the waits.
@@ -440,13 +441,13 @@ class Client(ClientCalls[Session], Blocking):
         sleep: Callable[[float], None] = time.sleep,
         jitter: Callable[[], float] = random.random,
     ) -> None:
-        http = httpx2.Client(**speaking_to(url, api_key, timeout), transport=transport)
+        http = httpx2.Client(**http_settings(url, api_key, timeout), transport=transport)
         super().__init__(Wire(BlockingLink(http, sleep), retry, request_id, jitter))
         self.admin = Admin(self._wire)
 
     def close(self) -> None:
         """Close the connections; the client cannot be used afterwards."""
-        finished(self._leave(None))
+        run_to_end(self._leave(None))
 
 
 class AsyncClient(ClientCalls[AsyncSession], Awaiting):
@@ -466,7 +467,7 @@ class AsyncClient(ClientCalls[AsyncSession], Awaiting):
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
         jitter: Callable[[], float] = random.random,
     ) -> None:
-        http = httpx2.AsyncClient(**speaking_to(url, api_key, timeout), transport=transport)
+        http = httpx2.AsyncClient(**http_settings(url, api_key, timeout), transport=transport)
         super().__init__(Wire(AwaitingLink(http, sleep), retry, request_id, jitter))
         self.admin = AsyncAdmin(self._wire)
 
@@ -475,6 +476,6 @@ class AsyncClient(ClientCalls[AsyncSession], Awaiting):
         await self._leave(None)
 
 
-async def _truths(wire: Wire, path: str, true_positions_m: Numbers, **more: Any) -> TruthScore:
-    document = {"true_positions_m": known_positions(true_positions_m), **more}
+async def _truths(wire: Wire, path: str, true_positions_m: Numbers, **fields: Any) -> TruthScore:
+    document = {"true_positions_m": known_positions(true_positions_m), **fields}
     return await wire.model(TruthScore, Call.with_json("POST", f"{path}/truths", document))

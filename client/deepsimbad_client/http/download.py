@@ -1,4 +1,4 @@
-"""A sealed map on its way into a file: written beside it, resumed after a break, checked before it takes its name."""
+"""The download of a sealed map: written beside its file, resumed after a break, checked before it takes its name."""
 
 import hashlib
 import os
@@ -17,23 +17,24 @@ PART, BEYOND_THE_END = 206, 416
 _ETAG = re.compile(r'"sha256:([0-9a-f]{64})"')
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
 
-OnBytes = Callable[[int, int | None], None]  # told of the bytes there and in all (None: not known)
+OnBytes = Callable[[int, int | None], None]  # (bytes that have come, bytes in all or None where that is unknown)
 
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map as it lies here."""
+    """A downloaded map."""
 
     path: Path
-    sha256: str  # which the service has named too
+    sha256: str  # equal to the one that the service named
     file_bytes: int
 
 
 async def download(wire: Wire, call: Call, path: Path, on_progress: OnBytes | None) -> MapFile:
-    """Fetch what `call` names; as long as something comes now and then it never gives up.
+    """Fetch the file that `call` asks for; a try that brings some bytes starts the count of tries anew.
 
-    What has come waits in `<name>.<sha256>.part`: the name tells a later try, in this process or another, of which
-    file it is the beginning.
+    The bytes that have come wait in `<name>.<sha256>.part`: the name tells a later try, in this process or another,
+    which file they begin. Raises InvalidArgumentError, TransportError, ApiError, UnexpectedAnswerError,
+    DamagedDownloadError.
     """
     if path.is_dir() or not path.parent.is_dir():
         raise InvalidArgumentError(f"{path} cannot be a file: it is a folder, or lies in one that is not there")
@@ -58,11 +59,11 @@ async def download(wire: Wire, call: Call, path: Path, on_progress: OnBytes | No
                 attempts = wire.attempts(call)
             wait_s = attempts.after_failure(error)
         await wire.link.sleep(wait_s or 0.0)
-    return await wire.link.aside(lambda: _finished(call, part, path))
+    return await wire.link.aside(lambda: _finish(call, part, path))
 
 
 async def _save(wire: Wire, response: httpx2.Response, path: Path, on_progress: OnBytes | None) -> Path:
-    """Add an answer's content to the part that it belongs to."""
+    """Add an answer's content to the part file that it belongs to, whose path is returned."""
     etag = _ETAG.search(response.headers.get("etag", ""))
     if etag is None:
         raise UnexpectedAnswerError(f"{response.request.url} does not name the sha256 of the file: is this a map?")
@@ -89,8 +90,8 @@ async def _save(wire: Wire, response: httpx2.Response, path: Path, on_progress: 
     return part
 
 
-def _finished(call: Call, part: Path, path: Path) -> MapFile:
-    """Check all that has come and let it take its name."""
+def _finish(call: Call, part: Path, path: Path) -> MapFile:
+    """Check the digest of a complete part file and rename it to `path`; raises DamagedDownloadError."""
     with part.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     if sha256 != part.suffixes[-2][1:]:
@@ -104,6 +105,6 @@ def _finished(call: Call, part: Path, path: Path) -> MapFile:
 
 
 def _parts(path: Path) -> list[Path]:
-    """What earlier tries have left."""
+    """The part files that earlier tries of `path` have left."""
     name = re.compile(re.escape(path.name) + r"\.[0-9a-f]{64}\.part")
     return [part for part in path.parent.iterdir() if name.fullmatch(part.name)]

@@ -20,7 +20,7 @@ _STOPPED_WITHIN_S = 15.0
 class LocalServer:
     """`deepsimbad serve` at `url`, a free loopback port, up between `with` and the end of its block.
 
-    Its log goes to `log_path`, absent: `server.log` beside the data directory, which is kept.
+    Its log goes to `log_path`, absent: `server.log` beside the data directory; both are kept.
     """
 
     def __init__(self, data_dir: Path, log_path: Path | None = None, environment: dict[str, str] | None = None) -> None:
@@ -62,17 +62,17 @@ class LocalServer:
 
     @property
     def pid(self) -> int:
-        """Of the process; raises DeepSimbadClientError where it is not up."""
+        """The id of the process; raises DeepSimbadClientError where it is not up."""
         if self._process is None:
             raise DeepSimbadClientError("the service is not up")
         return self._process.pid
 
     def wait(self, within_s: float | None = None) -> int | None:
-        """Wait until the process ends by itself; its exit status, None where it is not up."""
+        """Wait until the process ends by itself and return its exit status; None where it is not up."""
         return None if self._process is None else self._process.wait(within_s)
 
     def stop(self) -> None:
-        """Ask it to end, then insist."""
+        """Ask the process to end, and kill it where it has not within 15 s."""
         if self._process is not None:
             self._process.terminate()
             with suppress(subprocess.TimeoutExpired):
@@ -80,7 +80,7 @@ class LocalServer:
             self.kill()
 
     def kill(self) -> None:
-        """End it at once, as a power cut would."""
+        """Kill the process, which ends it as a power cut would."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()

@@ -20,14 +20,14 @@ class Answer(BaseModel):
 
     @property
     def request_id(self) -> str | None:
-        """By which the service's log tells of the request answered by this; None in a stream of events."""
+        """The id of this answer's request in the service's log; None in a stream of events."""
         with suppress(AttributeError):
             request_id: str | None = object.__getattribute__(self, "_request_id")
             return request_id
         return None
 
     def answering(self, request_id: str | None) -> Self:
-        """The same answer, which knows its request from now on."""
+        """Set `request_id` and return this answer."""
         object.__setattr__(self, "_request_id", request_id)
         return self
 
@@ -52,7 +52,7 @@ class Domain(Answer):
     input_size: tuple[int, int] | None = None
     """(width, height) an image is best resized to before it is sent; None: as it is, or no images at all."""
     grey_levels: tuple[int, int] | None = None
-    """What is shown black and white of views of more than 8 bits, as of the map's pictures; None: those had 8."""
+    """Levels shown as black and white in views of more than 8 bits, as in the map's pictures; None: those had 8."""
     takes: tuple[str, ...] = ("image",)
     encoding_dim: int | None = None
     """Length of an image's encoding; None: no images are taken. Ready ones may have any one length."""
@@ -107,11 +107,11 @@ class Retrieved(Answer):
 
 
 class ActionValue(Answer):
-    """What is expected of one move."""
+    """The value that the planner expects of one move."""
 
     action_m: float
     q_value: float | None = None
-    expected_bits: float | None = None  # that the view after it would tell
+    expected_bits: float | None = None  # of information in the view after the move
 
 
 class NextBestView(Answer):
@@ -136,7 +136,7 @@ class Localization(Answer):
 
 
 class LikelyDomain(Answer):
-    """A domain that the robot may be on, and where on it then: as `Localization`."""
+    """A domain that the robot may be on, with the answer of a `Localization` if it is."""
 
     domain: str
     map_version: int
@@ -155,7 +155,7 @@ class LikelyPlace(Place):
 
 
 class OtherDomains(Answer):
-    """Those that answered and are not told."""
+    """The domains that answered but are not listed."""
 
     n_domains: int
     probability: float  # of all of them together
@@ -205,11 +205,11 @@ class Coverage(Answer):
 
 
 class Landmarks(Answer):
-    """`GET /v1/domains/{domain}/landmarks`: what each began as; columns in the order of their numbers."""
+    """`GET /v1/domains/{domain}/landmarks`: the frame that each landmark began as; columns in landmark order."""
 
     map_version: int
-    n_map_images: tuple[int, ...]  # that list it
-    map_image: tuple[int | None, ...]  # that is the frame it began as
+    n_map_images: tuple[int, ...]  # that list the landmark
+    map_image: tuple[int | None, ...]  # made of the frame that the landmark began as
     frame: tuple[str | None, ...]
     drive: tuple[str | None, ...]
 
@@ -246,14 +246,14 @@ class ListedSession(Answer):
 
 
 class TruthScore(Answer):
-    """How well a session knew where its robot was, by truths told later."""
+    """How well a session knew where its robot was, by true positions sent later."""
 
     n_scored: int
     n_left_out: int
     anr: float | None = None
     """Averaged normalised rank in percent, 0 is perfect, 50 chance; None where no truth is known."""
     retrieval_ranks: tuple[float | None, ...] | None = None
-    """Of the best of its true map images by each view alone, from 0; None where none was told."""
+    """Rank, from 0, of the best true map image by each view alone; None where no true map image was given."""
     map_version: int
 
 
@@ -266,14 +266,14 @@ class Traverse(Answer):
     """(first, last) ranges of indices that have not arrived, below the greatest that has."""
     length_m: float | None = None  # from the least position to the greatest
     span_us: tuple[int, int] | None = None  # first and last known time of a frame
-    cameras: tuple[dict[str, Any], ...] = ()  # name, width, height, aspect_ratio, orientation; that of most first
+    cameras: tuple[dict[str, Any], ...] = ()  # name, width, height, aspect_ratio, orientation; of most frames first
     warnings: tuple[str, ...] = ()  # what a person should know of its pictures, in sentences
     digest: str | None = None  # SHA-256 over indices, contents, places and times; one drive, one digest
-    n_uninformative: int = 0  # frames whose pictures show nothing, or are so unlike all others that they seem to
+    n_uninformative: int = 0  # frames whose pictures show nothing, or seem to, being so unlike all others
     n_spooled: int = 0  # pictures that wait for the domain's evaluator to be fitted
     spooled_bytes: int = 0
     grey_levels: tuple[int, int] | None = None
-    """What is shown black and white of pictures of more than 8 bits; None: none came."""
+    """Levels shown as black and white in pictures of more than 8 bits; None: none came."""
 
 
 class FrameStored(Answer):
@@ -292,7 +292,7 @@ class FramesStored(Answer):
 
 
 class Job(Answer):
-    """A remap on its way, or ended."""
+    """A job that makes a map, under way or ended."""
 
     job_id: str
     domain: str
@@ -307,28 +307,28 @@ class Job(Answer):
 
     @property
     def stage_name(self) -> str:
-        """What it does, in words; one that has only just begun has told of no stage."""
+        """The present stage in words; the state where no stage is known yet."""
         return (self.stage or ("beginning" if self.state == "running" else self.state)).replace("_", " ")
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will happen to it."""
+        """Whether the job succeeded, failed or was cancelled."""
         return self.state in ENDED_STATES
 
     @property
     def check(self) -> dict[str, Any]:
-        """How its map compares with the one active before; empty where that was not looked at."""
-        return _within(self.result, "metrics", "check")
+        """How the new map compares with the one active before; empty where they were not compared."""
+        return _subdocument(self.result, "metrics", "check")
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know of its drives, in sentences."""
-        return [*_within(self.result, "metrics").get("warnings", ()), *self.check.get("warnings", ())]
+        """What a person should know of the job's drives, in sentences."""
+        return [*_subdocument(self.result, "metrics").get("warnings", ()), *self.check.get("warnings", ())]
 
     @property
     def second_season(self) -> dict[str, Any]:
-        """Whether its map learnt from a second drive of the route, and why not; empty where there was none."""
-        return _within(self.result, "metrics", "second_season")
+        """Whether the map learnt from a second drive of the route, and why not; empty where there was none."""
+        return _subdocument(self.result, "metrics", "second_season")
 
     @property
     def error_text(self) -> str:
@@ -355,12 +355,12 @@ class MapVersion(Answer):
 
     @property
     def check(self) -> dict[str, Any]:
-        """How it compares with the map that was active when it was made; empty where that was not looked at."""
-        return _within(self.metrics, "check")
+        """How it compares with the map that was active when it was made; empty where they were not compared."""
+        return _subdocument(self.metrics, "check")
 
 
-def _within(document: Any, *names: str) -> dict[str, Any]:
-    """What lies so deep in a document; empty where nothing does."""
+def _subdocument(document: Any, *names: str) -> dict[str, Any]:
+    """The mapping under the keys `names` of a nested document; empty where there is none."""
     for name in names:
         document = document.get(name) if isinstance(document, dict) else None
     return document if isinstance(document, dict) else {}

@@ -51,7 +51,7 @@ except ImportError as missing:
     raise MissingExtraError(f"encoding on board needs further packages: {INSTALL}") from missing
 
 RANKS_BYTES = 64
-"""What ranks take unless told otherwise; what that costs in accuracy: docs/results/onboard.md."""
+"""Default size of ranks; what that costs in accuracy: docs/results/onboard.md."""
 _MAX_PIXELS = 1 << 30  # the picture is the robot's own
 
 
@@ -60,7 +60,7 @@ class OnBoardEncoder:
 
     Given by `Client.on_board`, or loaded from a file that `save` wrote, without a network. It is made in milliseconds;
     the extractor is loaded with the first image, or by `load_extractor`. `content` is the landmark model as the service
-    sends it, `compute` on what a network runs (absent: the fastest that is installed); `digest` names the landmarks and
+    sends it, `compute` where a network runs (absent: the fastest that is installed); `digest` names the landmarks and
     is sent with every observation, so that no other map answers it. Raises InvalidLandmarkModelError.
     """
 
@@ -74,7 +74,7 @@ class OnBoardEncoder:
 
     @classmethod
     def load(cls, path: str | PathLike[str], compute: Compute | None = None) -> "OnBoardEncoder":
-        """From a file that `save` wrote. Raises SourceError, InvalidLandmarkModelError."""
+        """The encoder in a file that `save` wrote. Raises SourceError, InvalidLandmarkModelError."""
         try:
             content = Path(path).read_bytes()
         except OSError as error:
@@ -90,16 +90,16 @@ class OnBoardEncoder:
 
     @property
     def map_version(self) -> int:
-        """The map that the landmarks come from."""
+        """The version of the map that the landmarks come from."""
         return self.landmarks.map_version
 
     @property
     def n_landmarks(self) -> int:
-        """r."""
+        """The number of landmarks, r."""
         return self.landmarks.n_landmarks
 
     def load_extractor(self) -> None:
-        """Load what encodes images now, and not with the first one.
+        """Load the extractor now and not with the first image.
 
         Raises MissingExtraError, OtherWeightsError, InvalidLandmarkModelError.
         """
@@ -110,11 +110,11 @@ class OnBoardEncoder:
         """The evaluator with its extractor, whose weights are the map's."""
         with _named_errors("the map's extractor cannot be loaded here"):
             self._evaluator.load()
-            own, mapped = self._evaluator.weights_sha256 or "", self.landmarks.weights_sha256
-        if mapped and own != mapped:
+            weights_sha256, map_sha256 = self._evaluator.weights_sha256 or "", self.landmarks.weights_sha256
+        if map_sha256 and weights_sha256 != map_sha256:
             raise OtherWeightsError(
-                f"the weights here (sha256 {own or 'none'}) are not those that the images of map {self.map_version} "
-                f"were encoded by (sha256 {mapped}): install the service's release of them"
+                f"the weights here (sha256 {weights_sha256 or 'none'}) are not those that the images of map "
+                f"{self.map_version} were encoded by (sha256 {map_sha256}): install the service's release of them"
             )
         return self._evaluator
 
@@ -125,7 +125,7 @@ class OnBoardEncoder:
         encoding: Numbers | None = None,
         n_bits: int = USUAL_BITS,
     ) -> Observation:
-        """What `Client.localize` and `Session.observe` take as `on_board`; give exactly one form of the view.
+        """The observation that `Client.localize` and `Session.observe` take as `on_board`; give one form of the view.
 
         Of a map that compares encodings (`composed`) the unit encoding travels, in `n_bits` a number, 2 to 8: 61 bytes
         for 96 numbers by default, which tell more than all ranks. Of others the ranks that 64 bytes hold.
@@ -137,7 +137,7 @@ class OnBoardEncoder:
             return self.ranks(image, encoding=encoding)
         encodings = self._encoded(image, encoding)
         if encodings is None:
-            return self._nothing()
+            return self._blank_view()
         with _named_arguments():
             u, _ = compared_units(self._evaluator, encodings, self.landmarks.model)
             return Observation(pack_unit_encoding(u[0], n_bits), UNIT_ENCODING, self.digest)
@@ -145,46 +145,49 @@ class OnBoardEncoder:
     def ranks(
         self, image: "Image | NDArray[np.uint8] | None" = None, *, encoding: Numbers | None = None, m: int | None = None
     ) -> Observation:
-        """As `view`, by the m nearest of 1..r landmarks, the paper's descriptor; absent: as many as 64 bytes hold."""
+        """The observation as the m nearest of r landmarks, the paper's descriptor; m absent: as many as 64 bytes hold.
+
+        Takes the same forms of a view, and raises the same errors, as `view`.
+        """
         n_sent = ranked_landmarks_within(RANKS_BYTES, self.n_landmarks) if m is None else m
         if not 1 <= n_sent <= self.n_landmarks:
             raise InvalidArgumentError(f"m is {n_sent}: send 1 to {self.n_landmarks} landmarks")
         encodings = self._encoded(image, encoding)
         if encodings is None:
-            return self._nothing()
+            return self._blank_view()
         with _named_arguments():
             dissimilarities = self._evaluator.dissimilarities(encodings, self.landmarks.model)[0]
         nearest_first = np.argsort(rank_landmarks(dissimilarities))
         body = pack_ranked_landmarks(nearest_first[:n_sent].tolist(), self.n_landmarks)
         return Observation(body, RANKS, self.digest)
 
-    def _nothing(self) -> Observation:
+    def _blank_view(self) -> Observation:
         return replace(observation(dissimilarities=[0] * self.n_landmarks), landmark_model=self.digest)
 
     def _encoded(
         self, image: "Image | NDArray[np.uint8] | None", encoding: Numbers | None
     ) -> NDArray[np.float32] | None:
-        """[1, d]; None for an image that shows nothing."""
+        """The encoding of the view, [1, d]; None for an image that shows nothing."""
         if (image is None) == (encoding is None):
             raise InvalidArgumentError("give exactly one of image and encoding")
         return np.asarray(encoding, np.float32).reshape(1, -1) if image is None else self._of_image(image)
 
     def _of_image(self, image: "Image | NDArray[np.uint8]") -> NDArray[np.float32] | None:
-        """As `_encoded`."""
+        """The encoding of an image, [1, d]; None for one that shows nothing."""
         if not self._evaluator.takes_images:
             raise InvalidArgumentError("the domain has no extractor and takes ready encodings alone: give encoding")
         if isinstance(image, np.ndarray):
-            pixels, what = image, "the array given as image"
+            pixels, source = image, "the array given as image"
         else:
-            what = str(image) if isinstance(image, str | PathLike) else "the bytes given as image"
+            source = str(image) if isinstance(image, str | PathLike) else "the bytes given as image"
             try:
                 levels = levels_in(self.landmarks.model)
                 pixels = decode_image(image_bytes(image), _MAX_PIXELS, levels=levels)
             except DeepSimbadError as error:
-                raise BrokenFrameError(f"{what}: {error.message}") from error
+                raise BrokenFrameError(f"{source}: {error.message}") from error
         evaluator = self._loaded
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-            raise InvalidArgumentError(f"{what} is {list(pixels.shape)} {pixels.dtype}, not [height, width, 3] uint8")
+            raise InvalidArgumentError(f"{source} is {list(pixels.shape)} {pixels.dtype}, not [height, width, 3] uint8")
         with _named_errors("the image cannot be encoded"):
             pixels = evaluator.prepare(pixels)
             return None if is_blank(pixels) else evaluator.encode([pixels])
@@ -192,7 +195,7 @@ class OnBoardEncoder:
 
 @contextmanager
 def _named_arguments() -> Iterator[None]:
-    """Errors of what was given as this client names them."""
+    """Raise the library's errors of invalid input as InvalidArgumentError."""
     try:
         yield
     except InvalidInputError as error:
@@ -200,8 +203,8 @@ def _named_arguments() -> Iterator[None]:
 
 
 @contextmanager
-def _named_errors(what: str) -> Iterator[None]:
-    """The library's errors as this client names them."""
+def _named_errors(failure: str) -> Iterator[None]:
+    """Raise the library's errors as this client's; `failure` says what failed."""
     try:
         yield
     except (ImportError, MissingPackageError) as error:
@@ -209,4 +212,4 @@ def _named_errors(what: str) -> Iterator[None]:
     except InvalidImageError as error:
         raise InvalidArgumentError(error.message) from error
     except DeepSimbadError as error:
-        raise InvalidLandmarkModelError(f"{what}: {error.message}") from error
+        raise InvalidLandmarkModelError(f"{failure}: {error.message}") from error

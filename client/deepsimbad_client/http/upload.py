@@ -1,4 +1,4 @@
-"""Send a recording to a traverse, going on where an earlier attempt stopped."""
+"""Upload of a recording to a traverse, resumed where an earlier attempt stopped."""
 
 import dataclasses
 import time
@@ -28,17 +28,17 @@ Result = TypeVar("Result")
 
 @dataclass
 class UploadReport:
-    """What has become of a recording's frames."""
+    """How many of a recording's frames were sent, skipped, broken and left out."""
 
     n_frames: int  # that could be sent
     n_sent: int = 0  # by this run
-    n_skipped: int = 0  # which the service had already, equal
-    n_broken: Counter[str] = field(default_factory=Counter)  # could not be sent, by reason; the others go on
+    n_skipped: int = 0  # the service had them already, equal
+    n_broken: Counter[str] = field(default_factory=Counter)  # could not be sent, by reason
     broken_names: list[str] = field(default_factory=list)
     left_out: dict[str, int] = field(default_factory=dict)  # by the reader before, by reason
     left_out_names: dict[str, list[str]] = field(default_factory=dict)  # both kinds, by reason
     bytes_sent: int = 0  # of images and encodings
-    warnings: tuple[str, ...] = ()  # of the service, about the pictures that are there
+    warnings: tuple[str, ...] = ()  # of the service, about the traverse's pictures
     seconds: float = 0.0
 
     @property
@@ -69,17 +69,17 @@ def upload(
 
     The domain must exist, the traverse is made. Frames that are there already are compared by place, time and content:
     equal ones are passed over; others raise OtherFramesError before anything is sent, or are replaced with `replace`.
-    `on_progress` is told how far it is after every frame or batch. Raises SourceError (without `allow_missing` also as
-    soon as more than a twentieth of the recording is left out), ApiError, TransportError.
+    `on_progress` is called with the report after every frame or batch. Raises SourceError (without `allow_missing` also
+    as soon as more than a twentieth of the recording is left out), ApiError, TransportError.
     """
     if not recording.frames:
         raise SourceError(f"{recording.name} has no frames to send")
     left_out = LeftOut(recording, allow_missing=allow_missing)
     started = time.monotonic()
-    described = client.domain(domain)
-    recording, input_size = as_taken(recording, described.takes), described.input_size
-    stored = client.admin.create_traverse(domain, traverse, grey_levels=recording.grey_levels)
-    recording = recording.shown_by(stored.grey_levels)
+    domain_answer = client.domain(domain)
+    recording, input_size = as_taken(recording, domain_answer.takes), domain_answer.input_size
+    stored_traverse = client.admin.create_traverse(domain, traverse, grey_levels=recording.grey_levels)
+    recording = recording.shown_by(stored_traverse.grey_levels)
     report = UploadReport(len(recording.frames), left_out=recording.left_out, left_out_names=left_out.names)
 
     def tell() -> None:
@@ -87,24 +87,24 @@ def upload(
             on_progress(report)
 
     tell()
-    known = client.admin.frames(domain, traverse)
-    there = Comparison(recording, known)
-    for _ in there.reading(input_size, concurrency):
+    stored = client.admin.frames(domain, traverse)
+    comparison = Comparison(recording, stored)
+    for _ in comparison.read_digests(input_size, concurrency):
         report.n_skipped += 1
         tell()
-    others = there.others(f"{domain}/{traverse}", replace=replace)
-    _check_beside(recording, known, f"{domain}/{traverse}", input_size)
-    equal = set(there.rows) - others
-    rows = [row for row in range(len(recording.frames)) if row not in equal]
-    report.n_skipped = len(equal)
+    replaced_rows = comparison.rows_to_replace(f"{domain}/{traverse}", replace=replace)
+    _check_unsent(recording, stored, f"{domain}/{traverse}", input_size)
+    equal_rows = set(comparison.rows) - replaced_rows
+    rows = [row for row in range(len(recording.frames)) if row not in equal_rows]
+    report.n_skipped = len(equal_rows)
     if recording.encodings is not None:
         batch_size = max(1, BATCH_BYTES // max(1, 4 * recording.encodings.shape[1]))
         for start in range(0, len(rows), batch_size):
             batch = rows[start : start + batch_size]
             values, frames = recording.encodings[batch], [recording.frames[row] for row in batch]
             names = [frame.name for frame in frames]
-            known = columns_of(frames)
-            client.admin.put_frames(domain, traverse, encodings=values, name=names, replace=replace, **known)
+            columns = columns_of(frames)
+            client.admin.put_frames(domain, traverse, encodings=values, name=names, replace=replace, **columns)
             report.n_sent += len(batch)
             report.bytes_sent += values.nbytes
             tell()
@@ -128,24 +128,24 @@ def upload(
 
 
 class Comparison:
-    """A recording beside the frames that its traverse holds, known as `Admin.frames` tells."""
+    """A recording compared with the frames that its traverse holds, `stored` as from `Admin.frames`."""
 
-    def __init__(self, recording: Recording, known: Mapping[str, NDArray[Any]]) -> None:
-        row_of = {index: row for row, index in enumerate(known["index"].tolist())}
-        self.rows = [row for row, frame in enumerate(recording.frames) if frame.index in row_of]  # those it holds
-        self._n_beside = len(row_of) - len(self.rows)
+    def __init__(self, recording: Recording, stored: Mapping[str, NDArray[Any]]) -> None:
+        row_of = {index: row for row, index in enumerate(stored["index"].tolist())}
+        self.rows = [row for row, frame in enumerate(recording.frames) if frame.index in row_of]  # that are stored
+        self._n_unsent = len(row_of) - len(self.rows)
         self._recording = recording
         frames = [recording.frames[row] for row in self.rows]
-        at = [row_of[frame.index] for frame in frames]
-        self._stored = {name: known[name][at] for name in IDENTITY}
-        self._own = {**columns_of(frames), "content_digest": np.full(len(frames), UNKNOWN_CONTENT, np.uint64)}
+        stored_rows = [row_of[frame.index] for frame in frames]
+        self._stored = {name: stored[name][stored_rows] for name in IDENTITY}
+        self._columns = {**columns_of(frames), "content_digest": np.full(len(frames), UNKNOWN_CONTENT, np.uint64)}
 
-    def reading(
+    def read_digests(
         self, input_size: tuple[int, int] | None, concurrency: int, places: Sequence[int] | None = None
     ) -> Iterator[int]:
-        """Take the digest of every frame whose stored one is known, and tell its row; a broken one stays unknown.
+        """Read the digest of every frame whose stored digest is known, and yield its row; a broken one stays unknown.
 
-        `places` are those of `rows` that are read; None: all.
+        `places` are the indices into `rows` that are read; None: all.
         """
 
         def digest(place: int) -> int:
@@ -159,31 +159,32 @@ class Comparison:
             except BrokenFrameError:
                 return UNKNOWN_CONTENT
 
-        for place, found in in_order(digest, range(len(self.rows)) if places is None else places, concurrency):
-            self._own["content_digest"][place] = found
+        for place, frame_digest in in_order(digest, range(len(self.rows)) if places is None else places, concurrency):
+            self._columns["content_digest"][place] = frame_digest
             yield self.rows[place]
 
-    def differing(self) -> dict[str, NDArray[np.bool_]]:
-        """In what which of `rows` differ from those there."""
-        return differences(self._own, self._stored)
+    def difference_masks(self) -> dict[str, NDArray[np.bool_]]:
+        """By what differs, in words: [n] which of `rows` differ so from the stored frames; empty where none does."""
+        return differences(self._columns, self._stored)
 
-    def others(self, traverse: str, *, replace: bool) -> set[int]:
-        """Rows of the frames that differ from those there; raises OtherFramesError where these may not be replaced.
+    def rows_to_replace(self, traverse: str, *, replace: bool) -> set[int]:
+        """Rows of the frames that differ from the stored ones; raises OtherFramesError where they may not be replaced.
 
-        Nor may they where the traverse holds frames that the recording lacks: it would be made of two.
+        Without `replace` they may not, nor where the traverse holds frames that the recording lacks: it would be made
+        of two recordings.
         """
-        differ = self.differing()
-        if not differ:
+        masks = self.difference_masks()
+        if not masks:
             return set()
-        rows = [self.rows[place] for place in np.flatnonzero(np.any(list(differ.values()), axis=0))]
+        rows = [self.rows[place] for place in np.flatnonzero(np.any(list(masks.values()), axis=0))]
         names = [self._recording.frames[row].name for row in rows]
-        if replace and not self._n_beside:
+        if replace and not self._n_unsent:
             return set(rows)
         raise OtherFramesError(
             f"traverse {traverse} holds other frames than {self._recording.name}: {len(rows)} of the {len(self.rows)} "
-            f"that both have differ in {', '.join(differ)} ({shown(names)}), and nothing was sent: "
+            f"that both have differ in {', '.join(masks)} ({shown(names)}), and nothing was sent: "
             + (
-                f"{self._n_beside} frames there are not of this recording, so {_apart(traverse)}"
+                f"{self._n_unsent} frames there are not of this recording, so {_advice(traverse)}"
                 if replace
                 else "--replace puts these in their place, or choose another --traverse"
             ),
@@ -191,39 +192,41 @@ class Comparison:
         )
 
 
-def _check_beside(
-    recording: Recording, known: Mapping[str, NDArray[Any]], traverse: str, input_size: tuple[int, int] | None
+def _check_unsent(
+    recording: Recording, stored: Mapping[str, NDArray[Any]], traverse: str, input_size: tuple[int, int] | None
 ) -> None:
-    """Refuse a slice where the frames stored beside it are another recording's than the rest of its own.
+    """Check that stored frames which a slice leaves unsent are those of its full recording; raises OtherFramesError.
 
-    They must be equal by place and time, a few also by content. Raises OtherFramesError.
+    They must be equal by place and time, a few also by content.
     """
-    whole, sliced = recording.whole or recording, {frame.index for frame in recording.frames}
-    beside = [row for row, index in enumerate(known["index"].tolist()) if index not in sliced]
-    if not beside:
+    full, sent_indices = recording.whole or recording, {frame.index for frame in recording.frames}
+    unsent_rows = [row for row, index in enumerate(stored["index"].tolist()) if index not in sent_indices]
+    if not unsent_rows:
         return
-    stored = {name: known[name][beside] for name in ("index", *IDENTITY)}
-    indices = set(stored["index"].tolist())
-    rest = [row for row, frame in enumerate(whole.frames) if frame.index in indices]
-    if not rest and len(beside) < len(known["index"]):
-        return  # the stored ones go on behind the recording's end, and what both have is compared
+    unsent_columns = {name: stored[name][unsent_rows] for name in ("index", *IDENTITY)}
+    indices = set(unsent_columns["index"].tolist())
+    rest = [row for row, frame in enumerate(full.frames) if frame.index in indices]
+    if not rest and len(unsent_rows) < len(stored["index"]):
+        return  # the stored frames go on behind the recording's end, and the common ones are compared already
     if rest:
-        frames = [whole.frames[row] for row in rest]
-        encodings = None if whole.encodings is None else whole.encodings[rest]
-        other = Comparison(dataclasses.replace(whole, frames=frames, encodings=encodings, whole=None), stored)
-        for _ in other.reading(input_size, 1, spread(len(rest))):
+        frames = [full.frames[row] for row in rest]
+        encodings = None if full.encodings is None else full.encodings[rest]
+        comparison = Comparison(
+            dataclasses.replace(full, frames=frames, encodings=encodings, whole=None), unsent_columns
+        )
+        for _ in comparison.read_digests(input_size, 1, spread(len(rest))):
             pass
-        if not other.differing():
+        if not comparison.difference_masks():
             return
     names = [frame.name for frame in recording.frames[:1]]
     raise OtherFramesError(
-        f"traverse {traverse} holds frames of another recording than {recording.name}: {len(beside)} beside those to "
-        f"be sent, which the rest of it does not equal, and nothing was sent: {_apart(traverse)}",
+        f"traverse {traverse} holds frames of another recording than {recording.name}: {len(unsent_rows)} beside those "
+        f"to be sent, which the rest of it does not equal, and nothing was sent: {_advice(traverse)}",
         names,
     )
 
 
-def _apart(traverse: str) -> str:
+def _advice(traverse: str) -> str:
     domain, _, name = traverse.partition("/")
     return f"delete it first (`deepsimbad-client delete-traverse {domain} {name}`) or choose another --traverse"
 

@@ -1,10 +1,10 @@
-"""How calls are sent until they are answered: written once, for the blocking and the async client alike.
+"""The sending of calls until they are answered: written once, for the blocking and the async client alike.
 
-The clients and all that is here are written as coroutines over a link, the few things that differ between blocking
-and awaiting. A `BlockingLink` never suspends, so `finished` runs such a coroutine to its end in place; `shared` and
+The clients and this module are written as coroutines over a link, which holds the few things that differ between
+blocking and awaiting. A `BlockingLink` never suspends, so `run_to_end` runs such a coroutine in place; `shared` and
 `shared_stream` do that to the calls of a `Blocking` client and leave them to be awaited on an `Awaiting` one.
 """
-# ruff: noqa: D102 - what a link's methods do, httpx2's own of these names do
+# ruff: noqa: D102 - a link's methods do what httpx2's methods of these names do
 
 import asyncio
 import logging
@@ -55,8 +55,8 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 logger = logging.getLogger(__name__)
 
 
-def speaking_to(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -> dict[str, Any]:
-    """What an httpx2 client is made with; absent address and key are those of the environment.
+def http_settings(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -> dict[str, Any]:
+    """The keyword arguments of an httpx2 client; absent address and key are those of the environment.
 
     Raises InvalidArgumentError (no http(s) address, or a key that no header can carry).
     """
@@ -75,8 +75,8 @@ def speaking_to(url: str | None, api_key: str | None, timeout: httpx2.Timeout) -
     settings = {"base_url": url, "headers": headers, "timeout": timeout, "limits": _CONNECTIONS}
     if not _is_loopback(parsed.host):
         return settings
-    # A proxy of the environment does not lead to this machine; without one nothing is verified where nothing is
-    # encrypted, and to read all authorities' certificates takes 24 ms.
+    # A proxy of the environment does not lead to this machine. Plain http needs no certificates, and to read those of
+    # all authorities takes 24 ms.
     return settings | {"mounts": {f"all://{parsed.netloc.decode()}": None}, "verify": parsed.scheme == "https"}
 
 
@@ -113,11 +113,11 @@ class RetryPolicy:
 
 @dataclass
 class Attempts:
-    """The tries of one request: told what happened, it says what to do; nothing here waits or sends."""
+    """The tries of one request: after each it says how long to wait for the next; nothing here waits or sends."""
 
     policy: RetryPolicy
     repeat: Repeat
-    what: str  # the request in words, for errors
+    request_text: str  # the request in words, for errors
     jitter: Callable[[], float]  # draws in 0..1
     n_sent: int = 0
     answer_lost: bool = False  # an earlier try may have been acted on without our hearing of it
@@ -131,14 +131,14 @@ class Attempts:
         reason = str(error) or type(error).__name__
         if safe and not hopeless and self.n_sent < self.policy.attempts:
             self.answer_lost |= not untouched
-            return self._announced(self.policy.backoff_s(self.n_sent, self.jitter()), reason)
+            return self._announce(self.policy.backoff_s(self.n_sent, self.jitter()), reason)
         kind = TransportTimeoutError if isinstance(error, httpx2.TimeoutException) else TransportError
         tries = f"{self.n_sent} tries" if self.n_sent > 1 else "one try"
         advice = "; is the service running there?" if untouched else ""
-        raise kind(f"no answer to {self.what} after {tries}: {reason}{advice}") from error
+        raise kind(f"no answer to {self.request_text} after {tries}: {reason}{advice}") from error
 
     def after_answer(self, response: httpx2.Response) -> float | None:
-        """Seconds to wait before the next try; None when this answer is the last word."""
+        """Seconds to wait before the next try; None when this answer is final."""
         self.n_sent += 1
         status, code = response.status_code, problem_of(response).get("code")
         if status not in self.repeat.value or self.n_sent >= self.policy.attempts or code in LASTING_CODES:
@@ -149,17 +149,17 @@ class Attempts:
             wait_s = self.policy.backoff_s(self.n_sent, self.jitter())
         elif wait_s > self.policy.max_retry_after_s:
             return None
-        return self._announced(wait_s, f"{status} {code or ''}".rstrip())
+        return self._announce(wait_s, f"{status} {code or ''}".rstrip())
 
-    def _announced(self, wait_s: float, reason: str) -> float:
-        """The wait, told to whoever listens to this module's logger: a client that only waits looks dead."""
+    def _announce(self, wait_s: float, reason: str) -> float:
+        """Log the wait, since a client that only waits looks dead, and return it."""
         coming = f"try {self.n_sent + 1} of {self.policy.attempts}"
-        logger.info("%s: %s; trying again in %.1f s (%s)", self.what, reason, wait_s, coming)
+        logger.info("%s: %s; trying again in %.1f s (%s)", self.request_text, reason, wait_s, coming)
         return wait_s
 
 
 class BlockingLink:
-    """Blocks; safe to share between threads."""
+    """A link that blocks; safe to share between threads."""
 
     def __init__(self, http: httpx2.Client, sleep: Callable[[float], None]) -> None:
         self.http = http
@@ -194,7 +194,7 @@ class BlockingLink:
 
 
 class AwaitingLink:
-    """Awaits; what takes the disk a while is done aside."""
+    """A link that awaits; work that blocks on the disk runs in a thread."""
 
     def __init__(self, http: httpx2.AsyncClient, sleep: Callable[[float], Awaitable[None]]) -> None:
         self.http = http
@@ -252,9 +252,9 @@ class Wire:
                 raise InvalidArgumentError(
                     f"{headers[REQUEST_ID]!r} cannot name a request: use 1 to 64 letters, digits, '.', '_' and '-'"
                 )
-        given = {name: of_python(value) for name, value in call.params.items() if value is not None}
+        values = {name: of_python(value) for name, value in call.params.items() if value is not None}
         params = {
-            name: str(value) if isinstance(value, str | float | int) else list(value) for name, value in given.items()
+            name: str(value) if isinstance(value, str | float | int) else list(value) for name, value in values.items()
         }
         return self.link.http.build_request(
             call.method, call.path, params=params or None, headers=headers, content=call.body
@@ -277,60 +277,62 @@ class Wire:
             await self.link.sleep(wait_s)
 
     async def model(self, kind: type[Model], call: Call) -> Model:
-        """What a call is answered; raises as `send`."""
+        """Send a call and return its answer as a model; raises as `send`."""
         return model_of(kind, await self.send(call))
 
     async def model_list(self, kind: type[Model], key: str, path: str, **params: str | None) -> tuple[Model, ...]:
-        """Every entry of a list, page after page."""
+        """Every entry of a list, fetched page after page; raises as `send`."""
         entries: list[Model] = []
-        after = None
+        cursor = None
         while True:
-            call = Call("GET", path, {**params, "limit": PAGE_LENGTH, "after": after})
-            models, after = page_of(kind, key, await self.send(call))
+            call = Call("GET", path, {**params, "limit": PAGE_LENGTH, "after": cursor})
+            models, cursor = page_of(kind, key, await self.send(call))
             entries += models
-            if after is None:
+            if cursor is None:
                 return tuple(entries)
 
     async def events(self, call: Call) -> AsyncGenerator[httpx2.ServerSentEvent, None]:
-        """Yield the events of a stream, listened to once and left at the last; raises TransportError, ApiError."""
-        what = f"{call} at {self.url}"
+        """Yield the events of a stream over one connection; raises TransportError (it broke off or ended), ApiError."""
+        request_text = f"{call} at {self.url}"
         try:
             async with self.link.stream(self.request(call)) as response:
                 raise_for_problem(response)
                 async for event in self.link.events(response):
                     yield event
-                raise TransportError(f"{what} ended before all was told: the service stops, or the key was revoked")
+                raise TransportError(
+                    f"{request_text} ended before all was told: the service stops, or the key was revoked"
+                )
         except httpx2.TimeoutException as error:
-            raise TransportTimeoutError(f"{what} fell silent: {error or type(error).__name__}") from error
+            raise TransportTimeoutError(f"{request_text} fell silent: {error or type(error).__name__}") from error
         except httpx2.TransportError as error:
-            raise TransportError(f"{what} broke off: {error or type(error).__name__}") from error
+            raise TransportError(f"{request_text} broke off: {error or type(error).__name__}") from error
 
 
-def finished(coroutine: Coroutine[Any, Any, T]) -> T:
+def run_to_end(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine that never suspends to its end."""
     try:
         coroutine.send(None)
     except StopIteration as end:
-        result: T = end.value
-        return result
+        value: T = end.value
+        return value
     raise RuntimeError(f"{coroutine} waits for something on a blocking link")
 
 
 class Face:
-    """What calls are sent through.
+    """A class of calls over one wire.
 
-    Blocking and awaiting classes have the same calls, which are written once in a class beside them.
+    Its blocking and its awaiting class have the same calls, which are written once in their common base.
     """
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
 
     async def _leave(self, _error: BaseException | None, /) -> None:
-        """What the end of a `with` block does."""
+        """Leave the `with` block, which `_error` ended if it is not None."""
 
 
 class Blocking(Face):
-    """Its calls block until they are answered."""
+    """A face whose calls block until they are answered."""
 
     def __enter__(self) -> Self:
         return self
@@ -338,11 +340,11 @@ class Blocking(Face):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        finished(self._leave(error))
+        run_to_end(self._leave(error))
 
 
 class Awaiting(Face):
-    """Its calls are awaited."""
+    """A face whose calls are awaited."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -354,9 +356,9 @@ class Awaiting(Face):
 
 
 class Shared(Generic[P, Blocked, Awaited]):
-    """A call as two functions, of which a `Blocking` class shows the one and every other class the other.
+    """A call as two functions: a `Blocking` class shows the blocking one, every other class the awaiting one.
 
-    So `AdminCalls.maps(self, domain)`, in the class that holds a call, can be awaited whatever the face.
+    So a call of the common base, such as `AdminCalls.maps(self, domain)`, can be awaited whatever the face.
     """
 
     def __init__(self, blocking: Any, awaiting: Any) -> None:
@@ -378,7 +380,7 @@ def shared(
     awaiting: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]],
 ) -> Shared[P, T, Coroutine[Any, Any, T]]:
     """Make a plain method of a `Blocking` class and a coroutine method of an `Awaiting` one."""
-    return Shared(lambda *args, **kwargs: finished(awaiting(*args, **kwargs)), awaiting)
+    return Shared(lambda *args, **kwargs: run_to_end(awaiting(*args, **kwargs)), awaiting)
 
 
 def shared_stream(
@@ -390,10 +392,10 @@ def shared_stream(
         items = awaiting(*args, **kwargs)
         try:
             while True:
-                yield finished(items.__anext__())
+                yield run_to_end(items.__anext__())
         except StopAsyncIteration:
             return
         finally:
-            finished(items.aclose())
+            run_to_end(items.aclose())
 
     return Shared(blocking, awaiting)

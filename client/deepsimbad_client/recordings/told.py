@@ -15,7 +15,7 @@ from typing import Any
 
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad_client.errors import BrokenFrameError, SourceError
-from deepsimbad_client.http import observed
+from deepsimbad_client.http import scene_observation
 from deepsimbad_client.recordings import EncodedImage, Frame, Recording
 
 DETECTIONS, CAPTIONS = "detections.jsonl", "captions.csv"
@@ -47,7 +47,7 @@ class ToldRecording(Recording):
             if frame.name not in by_name:
                 raise BrokenFrameError(f"{FORMS[form]} says nothing of {frame.name}", f"not in {FORMS[form]}")
         picture = self.pictured.image(frame, input_size).body if self.with_image else None
-        body = observed({form: by_name[frame.name] for form, by_name in self.told.items()}, picture)
+        body = scene_observation({form: by_name[frame.name] for form, by_name in self.told.items()}, picture)
         return EncodedImage(body.body, body.content_type)
 
 

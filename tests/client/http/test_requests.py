@@ -18,7 +18,7 @@ from deepsimbad_client import Client, RetryPolicy, errors
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
 from deepsimbad_client.http import RETRIED_STATUSES, media_type_of, observation
 from deepsimbad_client.http.models import Job, Localization
-from deepsimbad_client.http.wire import speaking_to
+from deepsimbad_client.http.wire import http_settings
 
 from .scripted import JOB, LOCALIZATION, STATE, Script, answer
 
@@ -121,7 +121,12 @@ def test_a_proxy_is_not_asked_for_this_machine_and_named_for_others(monkeypatch)
 
 def test_only_plain_http_to_this_machine_goes_unverified():
     urls = ("http://127.0.0.1:1", "https://127.0.0.1:1", "http://robots.example", "https://robots.example")
-    assert [speaking_to(url, None, httpx2.Timeout(1)).get("verify", True) for url in urls] == [False, True, True, True]
+    assert [http_settings(url, None, httpx2.Timeout(1)).get("verify", True) for url in urls] == [
+        False,
+        True,
+        True,
+        True,
+    ]
 
 
 def test_media_type_of():
