@@ -7,7 +7,7 @@ from datetime import timedelta
 import pytest
 
 from deepsimbad.api import keys
-from deepsimbad.api.keys import KEPT_S, KeyRing, RateLimit, presented_key
+from deepsimbad.api.keys import GRACE_S, KeyRing, RateLimit, presented_key
 from deepsimbad.errors import RateLimitedError, UnauthorizedError, UnavailableError
 from deepsimbad.store.catalog import ApiKey
 from deepsimbad.store.records import KeyScope
@@ -59,23 +59,23 @@ def test_a_request_carries_one_key(headers, why):
 
 def test_a_ring_without_keys_is_open_until_the_first_and_closed_for_good(catalog):
     ring = ring_of(catalog)
-    assert (ring.needed(PATH), len(ring.by_id), ring.still_opens(None)) == (None, 0, True)
+    assert (ring.scope_for(PATH), len(ring.by_id), ring.still_opens(None)) == (None, 0, True)
     record, key = catalog.create_key(KeyScope.LOCALIZE)
-    assert ring.needed(PATH) is None, "it asks the catalog now and then, not every time"
+    assert ring.scope_for(PATH) is None, "it asks the catalog now and then, not every time"
     asyncio.run(ring.reread())
-    assert (ring.needed(PATH), len(ring.by_id)) == (KeyScope.LOCALIZE, 1)
+    assert (ring.scope_for(PATH), len(ring.by_id)) == (KeyScope.LOCALIZE, 1)
     assert ring.holder(key.text) == record
     assert ring.still_opens(record.key_id)
     assert not ring.still_opens(None), "a long answer ends that was begun while no key was asked"
     catalog.revoke_key(record.key_id)
     asyncio.run(ring.reread())
-    assert (ring.needed(PATH), len(ring.by_id)) == (KeyScope.LOCALIZE, 1)
+    assert (ring.scope_for(PATH), len(ring.by_id)) == (KeyScope.LOCALIZE, 1)
     assert not ring.still_opens(record.key_id)
     with pytest.raises(UnauthorizedError, match="revoked") as caught:
         ring.holder(key.text)
     assert caught.value.hints == {"key_id": record.key_id}
     ring.load(list)
-    assert ring.needed(PATH) is KeyScope.LOCALIZE
+    assert ring.scope_for(PATH) is KeyScope.LOCALIZE
 
 
 def test_who_shares_the_keys_is_told_of_a_change_before_it_counts_here(catalog):
@@ -116,7 +116,7 @@ def test_an_expired_key(catalog):
     time.sleep(0.01)
     with pytest.raises(UnauthorizedError, match="expired"):
         ring.holder(key.text)
-    assert (any(map(ring.still_opens, ring.by_id)), ring.needed(PATH)) == (False, KeyScope.LOCALIZE)
+    assert (any(map(ring.still_opens, ring.by_id)), ring.scope_for(PATH)) == (False, KeyScope.LOCALIZE)
 
 
 def test_every_key_is_compared_known_or_not(catalog, monkeypatch):
@@ -145,16 +145,16 @@ def test_a_catalog_that_cannot_be_read_lets_what_was_known_count_for_a_while(cat
         _, key = catalog.create_key(KeyScope.ADMIN)
     ring = ring_of(catalog, lambda: now_s)
     catalog.close()
-    now_s = KEPT_S - 1
+    now_s = GRACE_S - 1
     asyncio.run(ring.reread())
-    assert ring.needed(PATH) is (KeyScope.LOCALIZE if has_key else None)
+    assert ring.scope_for(PATH) is (KeyScope.LOCALIZE if has_key else None)
     assert not has_key or ring.holder(key.text).scope is KeyScope.ADMIN
-    now_s = KEPT_S + 1
+    now_s = GRACE_S + 1
     asyncio.run(ring.reread())
     for unread in (ring, KeyRing()):
         with pytest.raises(UnavailableError):
-            unread.needed(PATH)
-        assert unread.needed("/healthz") is None
+            unread.scope_for(PATH)
+        assert unread.scope_for("/healthz") is None
 
 
 # Rates

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from deepsimbad.api.app import Elsewhere, create_app
+from deepsimbad.api.app import Substitutes, create_app
 from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store import shared_sessions
 from deepsimbad.store.objects import Objects
@@ -21,7 +21,7 @@ pytest.importorskip("obstore", reason="the extra `objects` is not installed")
 
 @contextmanager
 def node(data_dir, url, is_own=lambda _: False, **settings):
-    shared = Elsewhere(sessions=partial(SharedSessionStore.sharing, Objects.open(url), is_own=is_own))
+    shared = Substitutes(sessions=partial(SharedSessionStore.sharing, Objects.open(url), is_own=is_own))
     app = create_app(small_settings(data_dir, **settings), InThisProcess(data_dir), shared)
     with Client(app, raise_server_exceptions=False) as client:
         yield client

@@ -34,7 +34,7 @@ from deepsimbad.api import (
     traverses,
     whereabouts,
 )
-from deepsimbad.api.door import STOPPING, Door
+from deepsimbad.api.door import SHUTTING_DOWN, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
@@ -82,26 +82,26 @@ _DESCRIPTION = (
 
 
 @dataclass(frozen=True)
-class Elsewhere:
-    """What a service that is one of several has from others, in the place of its own."""
+class Substitutes:
+    """Parts that a service which is one of several has from others, in the place of its own."""
 
-    keys: Callable[[], Sequence[KeyRecord]] | None = None  # reads them; None: the catalog does
-    # Opens those of a data directory, told whom to tell of every transaction
+    keys: Callable[[], Sequence[KeyRecord]] | None = None  # reads the keys; None: the catalog does
+    # Opens the sessions' file of a data directory; the function it takes is called with every transaction's writes
     sessions: Callable[[Path, Callable[[int], None]], SessionStore] = SessionStore.open
     owners: Owners | None = None  # of domains, where one view is asked of many
-    administrator: int | None = None  # which of several that administer; None: as the data directory notes
-    # A page of the jobs of a catalog and of others, as `Catalog.newest_jobs`
+    administrator: int | None = None  # number of this one among those that administer; None: the data directory's
+    # Reads a page of the jobs of this catalog and of others, as `Catalog.newest_jobs` does of one
     newest_jobs: Callable[[Catalog, str | None, int | None, int], ListPage[JobRecord, int]] = Catalog.newest_jobs
     make_evaluator: Callable[[EvaluatorConfig, Compute | None], Evaluator] = make_evaluator
 
 
-def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Elsewhere | None = None) -> FastAPI:
+def create_app(settings: Settings, run_job: RunJob | None = None, substitutes: Substitutes | None = None) -> FastAPI:
     """The service as an ASGI application; its files are opened when it starts.
 
     Args:
-        settings: All it is told; it reads no environment.
+        settings: All that it is configured by; it reads no environment.
         run_job: Does jobs; None: each in a process of its own (decision 0011).
-        elsewhere: What others do for it; None: nothing.
+        substitutes: Parts that others have; None: all parts are its own.
     """
     if run_job is None:
         n_threads = job_threads(settings.job_threads)
@@ -114,7 +114,7 @@ def create_app(settings: Settings, run_job: RunJob | None = None, elsewhere: Els
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         with ExitStack() as parts:
             try:
-                services = await run_sync(_start, settings, metrics, keys, run_job, elsewhere or Elsewhere(), parts)
+                services = await run_sync(_start, settings, metrics, keys, run_job, substitutes or Substitutes(), parts)
             except DeepSimbadError as error:
                 app.state.startup_error = error  # the server only reports that there was one
                 raise
@@ -149,7 +149,7 @@ async def follow(services: Services) -> None:
     """Take over what other machines have published; raises as `SharedCatalog.follow`."""
 
     def take_over(domain: str) -> bool:
-        """Whether there still is such a domain."""
+        """Serve what was published for a domain; whether it still exists."""
         try:
             services.catalog.domain(domain)
             if services.maps.serves(domain):  # else its map is fetched when it is asked for
@@ -166,17 +166,17 @@ async def follow(services: Services) -> None:
         return True
 
     def catch_up(catalog: SharedCatalog) -> set[str]:
-        """The domains that are no more."""
+        """Take over all domains that changed; the names of those that were deleted."""
         with catalog.following:  # who asks meanwhile waits until what has been read is served
             return {domain for domain in catalog.follow() if not take_over(domain)}
 
     if isinstance(services.catalog, SharedCatalog):
-        gone = await run_sync(catch_up, services.catalog)
-        await services.sessions.end_those(lambda session: session.domain in gone)
+        deleted_domains = await run_sync(catch_up, services.catalog)
+        await services.sessions.end_those(lambda session: session.domain in deleted_domains)
 
 
 async def _keep_following(services: Services) -> None:
-    """Follow now and then. A store that fails is told once; what is in memory goes on to serve."""
+    """Follow the map store again and again. A failure is logged once; what is in memory goes on to serve."""
     is_failing = False
     while isinstance(services.catalog, SharedCatalog):
         await asyncio.sleep(_FOLLOW_S)
@@ -212,7 +212,7 @@ async def _sweep(services: Services) -> None:
             log.exception("expired sessions could not be ended")
 
 
-def _opened(settings: Settings, administrator: int | None) -> Catalog:
+def _current_catalog(settings: Settings, administrator: int | None) -> Catalog:
     """The catalog; one that is shared knows what others published, as far as the store can be reached."""
     catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes, administrator)
     if isinstance(catalog, SharedCatalog):
@@ -227,12 +227,12 @@ def _opened(settings: Settings, administrator: int | None) -> Catalog:
 
 
 def _start(
-    settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, elsewhere: Elsewhere, parts: ExitStack
+    settings: Settings, metrics: Metrics, keys: KeyRing, run_job: RunJob, substitutes: Substitutes, parts: ExitStack
 ) -> Services:
     """Open everything; `parts` closes it again, last opened first."""
     parts.enter_context(service_lock(settings.data_dir, f"{settings.host}:{settings.port}"))
-    catalog = parts.enter_context(_opened(settings, elsewhere.administrator))
-    keys.load(elsewhere.keys or catalog.keys)
+    catalog = parts.enter_context(_current_catalog(settings, substitutes.administrator))
+    keys.load(substitutes.keys or catalog.keys)
     settings.check_exposure(len(keys.by_id))
     try:
         for line in catalog.discard_unfinished():
@@ -241,17 +241,17 @@ def _start(
         if error.hints.get("reason") != "disk_full":
             raise
         log.warning("nothing was discarded at start", extra={"why": error.message})  # who only reads is answered
-    if (missing := fallback()) is not None:
-        log.warning("the default network is not installed", extra={"why": missing})
-    evaluators = EvaluatorPool(settings.compute(), elsewhere.make_evaluator)
+    if (missing_package := fallback()) is not None:
+        log.warning("the default network is not installed", extra={"why": missing_package})
+    evaluators = EvaluatorPool(settings.compute(), substitutes.make_evaluator)
     evaluators.load_all(catalog.evaluators())
     maps_ = Maps(catalog, cache_bytes=settings.map_cache_bytes)
-    damaged = maps_.load_all(_LOADING_S)
+    damaged_domains = maps_.load_all(_LOADING_S)
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
-    store = parts.enter_context(elsewhere.sessions(settings.data_dir, metrics.committed))
-    live = Sessions(
+    store = parts.enter_context(substitutes.sessions(settings.data_dir, metrics.committed))
+    live_sessions = Sessions(
         store,
         maps_,
         evaluators,
@@ -262,7 +262,7 @@ def _start(
         snapshot_every=settings.snapshot_every,
         keep_ended_s=settings.keep_ended_sessions_s,
     )
-    parts.callback(live.close)
+    parts.callback(live_sessions.close)
     if isinstance(catalog, SharedCatalog):
         catalog.is_in_use = lambda domain, version, digest: (
             maps_.holds(domain, version, digest) or (domain, version) in SessionStore.pins(store)  # of those read here
@@ -273,14 +273,14 @@ def _start(
     retention = Retention(catalog, store, maps_, settings.keep_maps)
     retention.prune()
 
-    def switched(domain: str) -> None:
+    def serve_new_map(domain: str) -> None:
         try:
             maps_.refresh(domain)
             retention.prune(domain)
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    runner = JobRunner(catalog, run_job, switched, settings.max_jobs, metrics.job_ended)
+    runner = JobRunner(catalog, run_job, serve_new_map, settings.max_jobs, metrics.job_ended)
     parts.callback(runner.close)
     threads = {
         "the inference worker": lambda: worker.is_alive,
@@ -288,14 +288,14 @@ def _start(
         "the thread that runs jobs": lambda: runner.is_alive,
     }
     readiness = ReadinessCheck(catalog, store, threads)
-    metrics.watch(StateCollector(catalog, maps_, readiness.faults, worker, live))
+    metrics.watch(StateCollector(catalog, maps_, readiness.faults, worker, live_sessions))
     exposure = {"host": settings.host, "port": settings.port, "n_keys": sum(map(keys.still_opens, keys.by_id))}
     if not keys.by_id:
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)
     else:
         log.info("asks for keys", extra=exposure)
-    counts = {"n_domains": catalog.n_domains, "n_maps": maps_.n_loaded, "n_sessions": live.n_living}
-    log.info("opened", extra={**counts, "damaged": damaged})
+    counts = {"n_domains": catalog.n_domains, "n_maps": maps_.n_loaded, "n_sessions": live_sessions.n_living}
+    log.info("opened", extra={**counts, "damaged": damaged_domains})
     return Services(
         settings=settings,
         metrics=metrics,
@@ -305,12 +305,12 @@ def _start(
         evaluators=evaluators,
         open_traverses=open_traverses,
         spools=SpoolRoom(settings.data_dir, settings.max_spool_bytes),
-        sessions=live,
+        sessions=live_sessions,
         session_store=store,
         retention=retention,
-        truths=Truths(store, worker, live),
+        truths=Truths(store, worker, live_sessions),
         pictures=Pictures(settings.data_dir, settings.max_pixels),
-        session_events=SessionEvents(store, worker, live, settings.event_poll_s),
+        session_events=SessionEvents(store, worker, live_sessions, settings.event_poll_s),
         worker=worker,
         decoders=Decoders(settings.max_pixels),
         runner=runner,
@@ -318,8 +318,8 @@ def _start(
         faults=readiness.faults,
         uploads=Slots(settings.max_uploads, "batches of frames are on their way", "max_uploads"),
         event_streams=Slots(settings.max_event_streams, "event streams are open", "max_event_streams"),
-        owners=elsewhere.owners,
-        newest_jobs=partial(elsewhere.newest_jobs, catalog),
+        owners=substitutes.owners,
+        newest_jobs=partial(substitutes.newest_jobs, catalog),
     )
 
 
@@ -341,7 +341,7 @@ class Readiness(Answer):
 
 @dataclass(eq=False)
 class ReadinessCheck:
-    """What keeps the service from doing what it is there for; told by trying, once a second at most, in any thread."""
+    """Finds what keeps the service from working by trying it, once a second at most; usable from any thread."""
 
     catalog: Catalog
     sessions: SessionStore
@@ -351,7 +351,7 @@ class ReadinessCheck:
     _faults: tuple[str, ...] = ()
 
     def faults(self) -> tuple[str, ...]:
-        """One sentence for everything that is wrong; none where the service is ready. May wait for the disk."""
+        """One sentence for each fault; empty where the service is ready. May wait for the disk."""
         with self._lock:
             if time.monotonic() - self._looked_at > TRUSTED_S:
                 self._faults = tuple(dict.fromkeys(self._look()))
@@ -401,7 +401,7 @@ async def readyz(running: Running) -> Readiness:
     being served, and is told here.
     """
     if running.stopping.is_set():
-        raise UnavailableError(STOPPING.message, faults=[STOPPING.message])
+        raise UnavailableError(SHUTTING_DOWN.message, faults=[SHUTTING_DOWN.message])
     faults = await run_sync(running.faults, limiter=running.health)
     if faults:
         raise UnavailableError("; ".join(faults), faults=list(faults))

@@ -65,7 +65,7 @@ async def get_coverage(domain: DomainName, running: Running, map_version: Pinned
     snapshot = await _snapshot(running, domain, map_version)
     record = await run_sync(running.catalog.map, domain, snapshot.version)
     n_bytes = await run_sync(running.pictures.n_bytes, domain)
-    _, body = await running.written(snapshot.n_images, render_coverage, snapshot, record.metrics, n_bytes)
+    _, body = await running.render_json(snapshot.n_images, render_coverage, snapshot, record.metrics, n_bytes)
     return Response(body, media_type=JSON)
 
 
@@ -106,19 +106,19 @@ def render_coverage(snapshot: Map, metrics: Mapping[str, Any], thumbnail_bytes: 
         "basis": basis,
         "stretches": stretches,
         "route_position_m": at_m.round(3).tolist(),
-        "x_m": _known(snapshot.x_m, 3),
-        "y_m": _known(snapshot.y_m, 3),
-        "chance": _known(chance, 4),
+        "x_m": _finite_column(snapshot.x_m, 3),
+        "y_m": _finite_column(snapshot.y_m, 3),
+        "chance": _finite_column(chance, 4),
     }
 
 
-def _known(values: NDArray[np.floating] | None, digits: int) -> Metres:
+def _finite_column(values: NDArray[np.floating] | None, digits: int) -> Metres:
     if values is None or not np.isfinite(values).any():
         return None
     rounded = values.astype(np.float64).round(digits).astype(object)
     rounded[~np.isfinite(values)] = None
-    known: list[float | None] = rounded.tolist()
-    return known
+    column: list[float | None] = rounded.tolist()
+    return column
 
 
 class LandmarksAnswer(TypedDict):
@@ -138,28 +138,33 @@ async def get_landmarks(domain: DomainName, running: Running, map_version: Pinne
     """A map's landmarks: the frames they began as, and how many map images list each."""
     snapshot = await _snapshot(running, domain, map_version)
     n_bytes = await run_sync(running.pictures.n_bytes, domain)
-    _, body = await running.written(snapshot.n_landmarks, render_landmarks, snapshot, n_bytes)
+    _, body = await running.render_json(snapshot.n_landmarks, render_landmarks, snapshot, n_bytes)
     return Response(body, media_type=JSON)
 
 
 def render_landmarks(snapshot: Map, thumbnail_bytes: int) -> LandmarksAnswer:
     """A map's landmarks."""
-    own, began = snapshot.frame_digest, snapshot.landmark_digest
-    image_of = {} if own is None else dict(zip(own.tolist(), range(own.size), strict=True))
+    frame_digests, landmark_digests = snapshot.frame_digest, snapshot.landmark_digest
+    image_of = (
+        {} if frame_digests is None else dict(zip(frame_digests.tolist(), range(frame_digests.size), strict=True))
+    )
     return {
         "domain": snapshot.domain,
         "map_version": snapshot.version,
         "thumbnail_bytes": thumbnail_bytes,
         "n_map_images": np.bincount(snapshot.lists.reshape(-1), minlength=snapshot.n_landmarks).tolist(),
-        "map_image": _column(snapshot, None if began is None else [image_of.get(digest) for digest in began.tolist()]),
-        "frame": _column(snapshot, snapshot.landmark_frame),
-        "drive": _column(snapshot, snapshot.landmark_drive),
+        "map_image": _landmark_column(
+            snapshot,
+            None if landmark_digests is None else [image_of.get(digest) for digest in landmark_digests.tolist()],
+        ),
+        "frame": _landmark_column(snapshot, snapshot.landmark_frame),
+        "drive": _landmark_column(snapshot, snapshot.landmark_drive),
     }
 
 
-def _column(snapshot: Map, known: Iterable[Any] | None) -> list[Any]:
-    """Of every landmark, None where unknown."""
-    return [None] * snapshot.n_landmarks if known is None else [None if value == "" else value for value in known]
+def _landmark_column(snapshot: Map, values: Iterable[Any] | None) -> list[Any]:
+    """One value for every landmark; None where it is unknown."""
+    return [None] * snapshot.n_landmarks if values is None else [None if value == "" else value for value in values]
 
 
 _PICTURE: dict[int | str, dict[str, Any]] = {

@@ -14,8 +14,8 @@ from deepsimbad.api.problems import binary, declare_json, problems
 from deepsimbad.api.requests import (
     BINARY,
     GREATEST_ID,
-    KEPT,
     NAME_PATTERN,
+    REVALIDATE,
     Answer,
     DomainName,
     JsonBody,
@@ -80,7 +80,7 @@ class DomainBody(JsonBody):
     anchor: Annotated[AnchorBody | None, Field(description="Where x and y lie on Earth. May be changed.")] = None
 
     def options(self) -> dict[str, Any]:
-        """What may be changed, as far as it was named."""
+        """The options that may be changed later, as far as the body has them."""
         return self.model_dump(include=self.model_fields_set & {"thumbnails", "anchor"})
 
     @model_validator(mode="after")
@@ -188,18 +188,18 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
 @router.get("", responses=problems(422))
 async def list_domains(request: Request, running: Running, page: DomainPage) -> DomainList:
     """All domains, by name, a thousand an answer; of cold ones the maps are read."""
-    opened = request.scope["state"].get("domains")  # to this key; None: all
+    key_domains = request.scope["state"].get("domains")  # to this key; None: all
 
-    def described() -> DomainList:
-        answers, listed = [], running.catalog.domain_page(page.key, page.limit)
-        for record in listed.records:
-            if opened is not None and record.name not in opened:
+    def describe_page() -> DomainList:
+        answers, domain_page = [], running.catalog.domain_page(page.key, page.limit)
+        for record in domain_page.records:
+            if key_domains is not None and record.name not in key_domains:
                 continue
             with suppress(UnknownDomainError):  # deleted since it was listed
                 answers.append(describe_domain(record, running.evaluators, running.maps))
-        return DomainList(domains=answers, next=page.next(listed.last_key))
+        return DomainList(domains=answers, next=page.next(domain_page.last_key))
 
-    return await run_sync(described)
+    return await run_sync(describe_page)
 
 
 @router.get("/{domain}", responses=problems(404, 422))
@@ -236,7 +236,7 @@ async def get_landmark_model(
     What it sends with the tag in `If-Match` is never compared with other landmarks.
     """
 
-    def packed() -> tuple[str, bytes | None]:
+    def pack() -> tuple[str, bytes | None]:
         if map_version is None:
             snapshot = running.maps.active(domain).snapshot
         else:
@@ -245,8 +245,8 @@ async def get_landmark_model(
         is_known = names(request.headers.get("if-none-match"), etag)
         return etag, None if is_known else snapshot.portable_landmarks()
 
-    etag, content = await run_sync(packed, limiter=running.long_work)
-    headers = {**KEPT, "ETag": etag}
+    etag, content = await run_sync(pack, limiter=running.long_work)
+    headers = {**REVALIDATE, "ETag": etag}
     if content is None:
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     return Response(content, headers=headers, media_type=BINARY)
@@ -266,12 +266,14 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
     def make() -> tuple[DomainAnswer, bool]:
         nonlocal evaluator
         try:
-            present = running.catalog.domain(domain).evaluator
+            stored_config = running.catalog.domain(domain).evaluator
         except UnknownDomainError:
             running.evaluators.evaluator(evaluator.as_dict()).load()  # one that cannot be loaded should not be stored
         else:
-            if present.get("kind") == body.evaluator["kind"]:  # what was left out is as it is, whatever the default now
-                evaluator = evaluator_config({**present, **body.evaluator})
+            if (
+                stored_config.get("kind") == body.evaluator["kind"]
+            ):  # what was left out is as it is, whatever the default now
+                evaluator = evaluator_config({**stored_config, **body.evaluator})
         record, created = running.catalog.create_domain(
             domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
         )

@@ -45,27 +45,28 @@ SECURITY_HEADERS = {
     b"x-frame-options": b"DENY",
     b"cross-origin-resource-policy": b"same-origin",
 }
-# Codes of answers that turn a request away for what it is or how many there are, before it is looked into.
+# Codes of answers that turn a request away for its kind or its number, before its content is looked at.
 REFUSALS = frozenset(
     {
         *("unauthorized", "forbidden", "foreign_host", "rate_limited", "overloaded"),
         *("too_many_sessions", "too_many_jobs", "too_many_domains", "body_too_large", "image_too_large"),
     }
 )
-_CORS_SENT = (
+_CORS_REQUEST_HEADERS = (
     *("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key"),
     *("Range", "If-Range", "If-None-Match"),
 )
-_CORS_SHOWN = (
+_CORS_ANSWER_HEADERS = (
     *("X-Request-ID", "Retry-After", "Location", "WWW-Authenticate"),
     *("ETag", "Repr-Digest", "Content-Range", "Content-Disposition"),
 )
 UNROUTED = "(none)"
-STOPPING = UnavailableError("the service is shutting down")
+SHUTTING_DOWN = UnavailableError("the service is shutting down")
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _BATCH_PATH = re.compile(r"/v1/admin/domains/[^/]+/traverses/[^/]+/frames")
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
-_NOTED = ("key_id", "domain", "code", "limit", "session_id", "job_id")  # by whoever learnt it, or in the path
+# Of a request's state or its path, in its log line
+_LOG_FIELDS = ("key_id", "domain", "code", "limit", "session_id", "job_id")
 _LONGEST_PATH = 256  # of a path in the log: the sender chooses it
 _LONGEST_LENGTH = 20  # digits
 _SENDER_LEFT = 499  # as proxies log it; never sent
@@ -86,8 +87,8 @@ class Door:
                 self._let_in,
                 allow_origins=settings.cors_origins,
                 allow_methods=("GET", "POST", "PUT", "DELETE"),
-                allow_headers=_CORS_SENT,
-                expose_headers=_CORS_SHOWN,
+                allow_headers=_CORS_REQUEST_HEADERS,
+                expose_headers=_CORS_ANSWER_HEADERS,
             )
         self.settings = settings
         self.keys = keys
@@ -109,7 +110,7 @@ class Door:
             await self._app(scope, request.receive, request.send)
         except asyncio.CancelledError:  # the server stops and waits no longer
             if request.status == 0:
-                await error_response(scope, STOPPING)(scope, receive, request.send)
+                await error_response(scope, SHUTTING_DOWN)(scope, receive, request.send)
         except ClientDisconnect:  # nobody is left to be answered
             request.status = request.status or _SENDER_LEFT
         except Exception:
@@ -124,9 +125,9 @@ class Door:
         try:
             if not self.keys.by_id:
                 request.check_page()
-            needed = self.keys.needed(scope["path"])
-            if needed is not None:
-                self.keys.admit(scope, needed, self.rate_limit)
+            required_scope = self.keys.scope_for(scope["path"])
+            if required_scope is not None:
+                self.keys.admit(scope, required_scope, self.rate_limit)
             request.check_size()
         except DeepSimbadError as error:
             await error_response(scope, error)(scope, receive, send)
@@ -134,15 +135,15 @@ class Door:
             await (self._head if scope["method"] == "HEAD" else self._routes)(scope, receive, send)
 
     async def _head(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """What GET would answer, without its body: of a stream nothing is begun."""
-        with CancelScope() as until_begun:
+        """Answer as GET would, without its body; a stream is cancelled before it begins."""
+        with CancelScope() as cancel_scope:
 
             async def begin(message: Message) -> None:
-                if until_begun.cancel_called:  # heard only where the route waits for something
+                if cancel_scope.cancel_called:  # heard only where the route waits for something
                     return
                 await send(message)
                 await send({"type": "http.response.body"})
-                until_begun.cancel()
+                cancel_scope.cancel()
 
             scope["method"] = "GET"
             try:
@@ -160,38 +161,38 @@ class _Request:
         self._scope = scope
         self._receive = receive
         self._send = send
-        self._began = time.perf_counter()
+        self._start_s = time.perf_counter()
         self._was_counted = False
-        self._n_turns = 0  # that it has, of those who are under way
-        self._n_bytes = self._n_held = 0  # of the body, so far
+        self._n_turns = 0  # that it takes of the door's slots
+        self._n_bytes = self._n_held = 0  # of the body so far: all that came, and those counted as memory
         self._headers = dict(scope["headers"])
-        self._most_bytes, self._is_batch = most_body_bytes(scope, self._headers, door.settings)
+        self._max_bytes, self._is_batch = max_body_bytes(scope, self._headers, door.settings)
         request_id = self._headers.get(b"x-request-id", b"")
         if not _REQUEST_ID.fullmatch(request_id):
             request_id = b"%016x" % random.getrandbits(64)
         scope.setdefault("state", {})["request_id"] = request_id.decode()
         self._own_headers = {b"x-request-id": request_id, **SECURITY_HEADERS}
 
-    # What the head tells: each raises the error that the sender is answered
+    # Checks of the head: each raises the error that the sender is answered
 
     def check_page(self) -> None:
         """While no key is asked, refuse what a page of another host may have sent.
 
         A page's own name may be answered by a loopback address (DNS rebinding): its Host betrays it.
         """
-        settings, reached = self._door.settings, (self._scope.get("server") or ("",))[0]
+        settings, own_address = self._door.settings, (self._scope.get("server") or ("",))[0]
         host = self._headers.get(b"host", b"").decode("latin-1")
         origin = self._headers.get(b"origin", b"").decode("latin-1")
         if origin and origin.partition("://")[2] != host and not {origin, "*"} & set(settings.cors_origins):
-            what = f"a page of {origin[:100]!r} may not call it"
-        elif host and not _is_ours(host, settings.host, reached) and is_loopback(settings.host):
-            what = f"it is not asked by the name {host[:100]!r}"
+            reason = f"a page of {origin[:100]!r} may not call it"
+        elif host and not _is_ours(host, settings.host, own_address) and is_loopback(settings.host):
+            reason = f"it is not asked by the name {host[:100]!r}"
         else:
             return
-        raise ForeignHostError(f"this service asks for no key and answers its own machine alone: {what}")
+        raise ForeignHostError(f"this service asks for no key and answers its own machine alone: {reason}")
 
     def check_size(self) -> None:
-        """Judge how the body will come, and whether there is room for it."""
+        """Refuse a body that is too large, or for which there is no room, by what the head declares."""
         headers = self._headers
         declared = headers.get(b"content-length", b"0").strip()
         if not declared.isdigit() or len(declared) > _LONGEST_LENGTH:
@@ -207,7 +208,7 @@ class _Request:
                 f"Content-Encoding {packing[:100].decode('ascii', 'replace')!r} is not taken: send the body as it is",
                 allowed=["identity"],
             )
-        if n_declared > self._most_bytes:
+        if n_declared > self._max_bytes:
             raise self._too_large(f"the body has {n_declared} bytes")
         if self._scope["path"] in ALWAYS_ANSWERED:
             self._was_counted = True
@@ -224,7 +225,7 @@ class _Request:
         message = await self._receive()
         if message["type"] == "http.request":
             self._n_bytes += len(message.get("body", b""))
-            if self._n_bytes > self._most_bytes:
+            if self._n_bytes > self._max_bytes:
                 raise self._too_large("the body is longer than is taken")
             n_more = self._n_bytes - FREE_BYTES - self._n_held
             if n_more > 0 and not self._is_batch:  # those go to the disk as they come
@@ -235,7 +236,7 @@ class _Request:
         return message
 
     async def send(self, message: Message) -> None:
-        """Give a part of the answer on; its first ends the request's turn."""
+        """Pass on a part of the answer; the first one ends the request's turn."""
         if message["type"] == "http.response.start":
             self._door.under_way.give_back(self._n_turns)
             self._n_turns, self.status = 0, message["status"]
@@ -246,21 +247,21 @@ class _Request:
         await self._send(message)
 
     def end(self) -> None:
-        """The answer has gone, or nobody waits for it: give back what was taken, and tell of it."""
+        """Give back the request's slots and bytes, count it and log it: the answer has gone, or nobody waits for it."""
         self._door.under_way.give_back(self._n_turns)
         self._door.body_bytes.give_back(self._n_held)
-        seconds = time.perf_counter() - self._began
+        seconds = time.perf_counter() - self._start_s
         scope, metrics = self._scope, self._door.metrics
         # Labels come from our own words alone: a stranger's paths would grow the registry without end.
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
         metrics.request_ended(method, route, self.status, seconds)
-        state, about = scope["state"] | (scope.get("path_params") or {}), {}
-        for name in _NOTED:
+        state, log_fields = scope["state"] | (scope.get("path_params") or {}), {}
+        for name in _LOG_FIELDS:
             if name in state:
-                about[name] = state[name]
-        if about.get("code") in REFUSALS:
-            metrics.refused(about.get("limit", about["code"]))
+                log_fields[name] = state[name]
+        if log_fields.get("code") in REFUSALS:
+            metrics.refused(log_fields.get("limit", log_fields["code"]))
         if log.isEnabledFor(logging.INFO):
             line = {
                 "request_id": scope["state"]["request_id"],
@@ -270,19 +271,21 @@ class _Request:
                 "status": self.status,
                 "ms": round(seconds * 1000, 2),
             }
-            log.info("request", extra=line | about)
+            log.info("request", extra=line | log_fields)
 
     def _count(self) -> None:
         self._door.under_way.take()
         self._was_counted, self._n_turns = True, 1
 
-    def _too_large(self, what: str) -> BodyTooLargeError:
-        most = self._most_bytes
-        return BodyTooLargeError(f"{what}; at most {most} are taken here, send less at once", max_bytes=most)
+    def _too_large(self, complaint: str) -> BodyTooLargeError:
+        max_bytes = self._max_bytes
+        return BodyTooLargeError(
+            f"{complaint}; at most {max_bytes} are taken here, send less at once", max_bytes=max_bytes
+        )
 
 
-def most_body_bytes(scope: Scope, headers: Mapping[bytes, bytes], settings: Settings) -> tuple[int, bool]:
-    """How long the body of a request may be, and whether it is a batch, which goes to the disk as it comes."""
+def max_body_bytes(scope: Scope, headers: Mapping[bytes, bytes], settings: Settings) -> tuple[int, bool]:
+    """The most bytes of a request's body, and whether it is a batch, which goes to the disk as it comes."""
     if scope["method"] == "POST" and _BATCH_PATH.fullmatch(scope["path"]) is not None:
         return settings.max_batch_bytes, True
     is_image = headers.get(b"content-type", b"").lower().startswith(b"image/")

@@ -23,13 +23,13 @@ async def _session(session_id: SessionId, request: Request, running: Running) ->
     return await run_sync(running.session_events.find, session_id, robot_of(request))
 
 
-async def _followed(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> SessionRecord:
-    """The same, so that one whose map is no more is refused before a stream begins."""
+async def _followable_session(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> SessionRecord:
+    """The session of the path, so that one whose map is no more is refused before a stream begins."""
     await run_sync(running.sessions.engine_of, session)
     return session
 
 
-def _observed(view: SessionView) -> SessionAnswer:
+def _observation_answer(view: SessionView) -> SessionAnswer:
     return render_observation(view, Stopwatch())
 
 
@@ -47,12 +47,17 @@ def _observed(view: SessionView) -> SessionAnswer:
     },
 )
 async def get_session_events(
-    session: Annotated[SessionRecord, Depends(_followed)],
+    session: Annotated[SessionRecord, Depends(_followable_session)],
     request: Request,
     running: Running,
-    after: Annotated[
+    after_sequence: Annotated[
         int | None,
-        Query(ge=0, le=GREATEST_ID, description="Begin behind the event of this id; 0: from the first; absent: now."),
+        Query(
+            alias="after",
+            ge=0,
+            le=GREATEST_ID,
+            description="Begin behind the event of this id; 0: from the first; absent: now.",
+        ),
     ] = None,
     last_event_id: Annotated[
         str | None, Header(pattern=r"^\d{1,9}$", description="The same, as a browser says that was cut off.")
@@ -63,14 +68,14 @@ async def get_session_events(
     What has passed can be had again, of a session that has ended too, as long as it is known. The stream may end
     earlier, when the service shuts down or the key is revoked: ask again, behind the last event that came.
     """
-    begin = int(last_event_id) if last_event_id is not None else after
+    last_sequence = int(last_event_id) if last_event_id is not None else after_sequence
     key_id = key_id_of(request)
-    async for event in running.session_events.follow(session, begin):
+    async for event in running.session_events.follow(session, last_sequence):
         if running.stopping.is_set() or not running.keys.still_opens(key_id):
             return
         if event is None:
             continue
-        render = _observed if event.is_observation else render_session
+        render = _observation_answer if event.is_observation else render_session
         name = "observation" if event.is_observation else "prior"
         yield ServerSentEvent(data=render(event.view), event=name, id=str(event.sequence))
     yield ServerSentEvent(data={"session_id": session.session_id}, event="done")

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from numpy.typing import NDArray
 from pydantic import FailFast, Field, StrictFloat
 
-from deepsimbad.api.localizations import IMAGE_SCHEMA, only
+from deepsimbad.api.localizations import IMAGE_SCHEMA, list_schema
 from deepsimbad.api.problems import binary, declare, invalid_body, problems
 from deepsimbad.api.requests import (
     BINARY,
@@ -27,7 +27,7 @@ from deepsimbad.api.requests import (
     parse_json,
     read_bytes,
 )
-from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
+from deepsimbad.api.scenes import MOST_PARTS, SCENE_BODIES, SCENE_MEMBERS, SCENE_SCHEMA, scene_in
 from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.drive import FRAME_NAME, Drive
 from deepsimbad.core.frames import MAX_POSITION_M, Camera, content_digest
@@ -47,7 +47,7 @@ router = APIRouter(
     prefix="/v1/admin/domains/{domain}/traverses/{name}/frames", tags=["admin: traverses"], route_class=StrictRoute
 )
 
-FRAME_TYPES = (*MEDIA_TYPES, JSON, *TOLD_BODIES)
+FRAME_TYPES = (*MEDIA_TYPES, JSON, *SCENE_BODIES)
 _SPOOL_CHUNK_BYTES = 1 << 20
 
 # Bodies and answers
@@ -63,8 +63,10 @@ class FrameBody(JsonBody):
     text: Any = None
 
 
-_ENCODING_SCHEMA = only("encoding", {"type": "number"}, "A ready encoding, as long as the others of the traverse.")
-_FRAME_SCHEMA = {"oneOf": [_ENCODING_SCHEMA, TOLD_SCHEMA]}
+_ENCODING_SCHEMA = list_schema(
+    "encoding", {"type": "number"}, "A ready encoding, as long as the others of the traverse."
+)
+_FRAME_SCHEMA = {"oneOf": [_ENCODING_SCHEMA, SCENE_SCHEMA]}
 
 
 class FrameAnswer(Answer):
@@ -101,7 +103,7 @@ def _metres(description: str) -> Any:
         200: {"model": FrameAnswer, "description": "It replaced the frame of that index"},
         **problems(404, 409, 413, 415, 422),
     },
-    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _FRAME_SCHEMA, **TOLD_BODIES}),
+    openapi_extra=declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: _FRAME_SCHEMA, **SCENE_BODIES}),
 )
 async def put_frame(
     domain: DomainName,
@@ -139,35 +141,35 @@ async def put_frame(
         raise InvalidInputError("camera is what took a picture, and the body is an encoding: leave it out")
     body = await read_bytes(request)
     place = {"index": index, "position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
-    known: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
-    known |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
+    columns: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
+    columns |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
 
-    def store(encodings: NDArray[np.float32], spooled: bytes | None = None, **about: Any) -> tuple[bool, int]:
+    def store(encodings: NDArray[np.float32], spooled: bytes | None = None, **facts: Any) -> tuple[bool, int]:
         pictures = {} if spooled is None else {index: spooled}
         with running.open_traverses.lend(domain, name) as traverse:
-            n_new, _ = traverse.put_frames(Drive(**known, encodings=encodings, **about), replace, pictures)
+            n_new, _ = traverse.put_frames(Drive(**columns, encodings=encodings, **facts), replace, pictures)
             return n_new == 1, traverse.n_frames
 
-    def store_seen(encoded: EncodedImage, shows_nothing: bool, picture: Decoded | None) -> tuple[bool, int]:
-        about: dict[str, Any] = {}
+    def store_scene(encoded_image: EncodedImage, shows_nothing: bool, picture: Decoded | None) -> tuple[bool, int]:
+        facts: dict[str, Any] = {}
         if picture is not None:
             if record.options.get("thumbnails"):
-                digest = content_digest(np.ascontiguousarray(encoded.values, "<f4").tobytes())
+                digest = content_digest(np.ascontiguousarray(encoded_image.values, "<f4").tobytes())
                 running.pictures.keep(domain, [(digest, picture.body)])
-            about = {
+            facts = {
                 "spooled": picture.body if evaluator.fitting is Fitting.IMAGES else None,
                 "camera": None if picture.size is None else Camera(*picture.size, camera),
                 "grey_levels": None if picture.is_blank else picture.levels,
             }
         return store(
-            encoded.values[np.newaxis],
-            weights_sha256=encoded.weights_sha256,
+            encoded_image.values[np.newaxis],
+            weights_sha256=encoded_image.weights_sha256,
             content_digest=np.array([content_digest(body)], np.uint64),
             shows_nothing=np.array([shows_nothing]),
-            **about,
+            **facts,
         )
 
-    async def stored(document: dict[str, Any], levels: GreyLevels | None) -> tuple[bool, int]:
+    async def store_view(document: dict[str, Any], levels: GreyLevels | None) -> tuple[bool, int]:
         picture: Decoded | None
         if media_type in MEDIA_TYPES:
             picture = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
@@ -175,23 +177,23 @@ async def put_frame(
         else:
             scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
         check_whole(evaluator, scene)
-        seen = await encoded(running.worker, evaluator, scene, Priority.BATCH)
-        return await run_sync(store_seen, seen, scene.is_blank, picture)
+        encoded_image = await encoded(running.worker, evaluator, scene, Priority.BATCH)
+        return await run_sync(store_scene, encoded_image, scene.is_blank, picture)
 
     frame = await parse_json(body, FrameBody, running) if media_type == JSON else FrameBody()
     if "encoding" in frame.model_fields_set and len(frame.model_fields_set) == 1:
         values = np.array(frame.encoding, np.float64)
         created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
-    elif media_type == JSON and not (frame.model_fields_set and frame.model_fields_set <= TOLD):
+    elif media_type == JSON and not (frame.model_fields_set and frame.model_fields_set <= SCENE_MEMBERS):
         raise invalid_body("give encoding; or objects, text, or both")
     else:
-        told = frame.model_dump(include=set(TOLD))
+        members = frame.model_dump(include=set(SCENE_MEMBERS))
         if evaluator.fitting is Fitting.IMAGES:
             await run_sync(running.spools.make_room, domain, len(body))
         try:
-            created, n_frames = await stored(told, levels)
+            created, n_frames = await store_view(members, levels)
         except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay
-            created, n_frames = await stored(told, await run_sync(_levels_of, running, domain, name))
+            created, n_frames = await store_view(members, await run_sync(_levels_of, running, domain, name))
     response.status_code = 201 if created else 200
     return FrameAnswer(index=index, n_frames=n_frames)
 
@@ -214,13 +216,13 @@ async def get_frames(domain: DomainName, name: TraverseName, running: Running) -
     """The places, times and digests of all frames of a traverse, by which a drive is compared before it is sent."""
     await run_sync(running.catalog.domain, domain)
 
-    def packed() -> bytes:
+    def pack() -> bytes:
         with running.open_traverses.lend(domain, name) as traverse:
             content = BytesIO()
             np.savez(content, **traverse.known())  # type: ignore[arg-type]
             return content.getvalue()
 
-    return Response(await run_sync(packed, limiter=running.batches), media_type=BINARY)
+    return Response(await run_sync(pack, limiter=running.batches), media_type=BINARY)
 
 
 @router.post(
@@ -243,7 +245,7 @@ async def post_frames(
 ) -> BatchAnswer:
     """Store a batch of frames whose encodings are known, all or none; the same indices again replace them."""
     await run_sync(running.catalog.domain, domain)
-    await run_sync(_levels_of, running, domain, name)  # as above
+    await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
     media_type_of(request, (BINARY,))
     max_bytes = running.settings.max_batch_bytes
 
@@ -255,7 +257,7 @@ async def post_frames(
             return BatchAnswer(n_new=n_new, n_replaced=n_replaced, n_frames=traverse.n_frames)
 
     data_dir = running.settings.data_dir  # the system's folder for such files is often memory
-    with running.uploads.taken(), storage_faults(data_dir), tempfile.TemporaryFile(dir=data_dir) as spool:
+    with running.uploads.slot(), storage_faults(data_dir), tempfile.TemporaryFile(dir=data_dir) as spool:
         chunk = bytearray()
         async for piece in request.stream():
             chunk += piece

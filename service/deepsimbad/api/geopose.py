@@ -73,8 +73,8 @@ def render_geopose(snapshot: Map, anchor: AnchorBody | None, image: int) -> GeoP
             reason="no_heading",
         )
     latitude, longitude = on_earth(float(route.x_m[image]), float(route.y_m[image]), **anchor.model_dump())
-    turned = math.radians(anchor.bearing_deg)
+    bearing_rad = math.radians(anchor.bearing_deg)
     return {
         "position": {"lat": latitude, "lon": longitude, "h": anchor.height_m},
-        "angles": {"yaw": (math.degrees(heading - turned) + 180) % 360 - 180, "pitch": 0.0, "roll": 0.0},
+        "angles": {"yaw": (math.degrees(heading - bearing_rad) + 180) % 360 - 180, "pitch": 0.0, "roll": 0.0},
     }

@@ -105,7 +105,7 @@ class RemapBody(JsonBody):
     ] = None
 
     def config(self) -> RemapConfig:
-        """The job's form; raises InvalidMapConfigError."""
+        """The configuration of the job; raises InvalidMapConfigError."""
         return RemapConfig(**{name: getattr(self, name) for name in type(self).model_fields})
 
 
@@ -179,9 +179,9 @@ async def post_remap(
     job_id = id_under_key(request, REMAP, domain, idempotency_key)
 
     def submit() -> JobAnswer:
-        before = running.runner.made_before(job_id, config)
-        if before is not None:
-            return JobAnswer.model_validate(before)
+        earlier_job = running.runner.made_before(job_id, config)
+        if earlier_job is not None:
+            return JobAnswer.model_validate(earlier_job)
         record = running.catalog.domain(domain)
         if config.camera_of is not None:
             camera_domain(running.catalog, config.camera_of, record)
@@ -191,8 +191,9 @@ async def post_remap(
                 with Traverse.open(running.settings.data_dir, domain, name) as traverse:
                     n_frames[name] = traverse.n_frames
         if config.append and record.active_version is None:
-            what = "to append to: make one first, without append"
-            raise NoActiveMapError(f"domain {domain} has no active map {what}", domain=domain)
+            raise NoActiveMapError(
+                f"domain {domain} has no active map to append to: make one first, without append", domain=domain
+            )
         if config.append and record.active_version is not None:
             refuse_known_traverse(running.catalog.map(domain, record.active_version), config.training_traverse)
         with suppress(NoActiveMapError, UnavailableError):  # a damaged one keeps nobody from making another
@@ -230,11 +231,11 @@ async def post_experience(
             return await run_sync(running.runner.submit, domain, config, job_id)
         finally:  # what was kept counts now or never, though the job be refused
             try:
-                ranked = await running.truths.rank(body.session_id, body.true_positions_m)
-                await run_sync(running.metrics.fed_back, domain, ranked.new_since(before_m).tolist())
+                ranking = await running.truths.rank(body.session_id, body.true_positions_m)
+                await run_sync(running.metrics.fed_back, domain, ranking.new_since(before_m).tolist())
             except DeepSimbadError as error:  # the job is on its way all the same
-                about = {"domain": domain, "session_id": body.session_id}
-                log.warning("truths could not be ranked: %s", error, extra=about)
+                labels = {"domain": domain, "session_id": body.session_id}
+                log.warning("truths could not be ranked: %s", error, extra=labels)
 
     job = await run_sync(running.runner.made_before, job_id, config) or await learn()
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
@@ -248,7 +249,7 @@ async def _job(job_id: JobId, running: Running) -> JobRecord:
 
 async def room_for_a_stream(running: Running) -> AsyncIterator[None]:
     """Room for one more stream, until it ends."""
-    with running.event_streams.taken():
+    with running.event_streams.slot():
         yield
 
 
@@ -281,11 +282,11 @@ async def get_job_events(
 
     The stream may end earlier, when the service shuts down or the key is revoked: ask for the job again.
     """
-    shown: JobRecord | None = None
+    last_job: JobRecord | None = None
     key_id = key_id_of(request)
     while not running.stopping.is_set() and running.keys.still_opens(key_id):
-        if job != shown:
-            shown = job
+        if job != last_job:
+            last_job = job
             yield ServerSentEvent(
                 data=JobAnswer.model_validate(job), event="done" if job.state.is_final else "progress"
             )

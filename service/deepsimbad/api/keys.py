@@ -19,18 +19,18 @@ from deepsimbad.store.records import KeyRecord, KeyScope, now
 log = logging.getLogger(__name__)
 
 REREAD_S = 1.0  # a key that was made or revoked counts within this time
-KEPT_S = 60.0  # a catalog that cannot be read lets the last known keys count for so long
+GRACE_S = 60.0  # a catalog that cannot be read lets the last known keys count for so long
 MAX_BUCKETS = 10_000
 _OF_DOMAIN = re.compile(r"/v1/domains/([^/]+)")
 _NO_DIGEST = "0" * 64  # what a key that does not exist is compared with
-_HOW = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deepsimbad keys create` makes one"
+_KEY_HELP = "send a key as `Authorization: Bearer <key>` or `X-API-Key: <key>`; `deepsimbad keys create` makes one"
 
 
 class KeyRing:
     """The keys as the catalog had them a moment ago; `by_id` holds all that were ever created.
 
-    Where there is none the service is open. Once a key was seen it is closed for good, whatever is read. Who shares the
-    keys is told by `announce` that they have changed, before that counts here.
+    Without any key the service is open. Once there was a key it stays closed, whatever is read later. Before a change
+    of the keys counts here, `announce` tells those that share them.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -41,7 +41,7 @@ class KeyRing:
         self.by_id: dict[str, KeyRecord] = {}
 
     def load(self, read: Callable[[], Sequence[KeyRecord]]) -> None:
-        """Read the keys for the first time, and name what reads them from then on; raises what that raises."""
+        """Read the keys by `read`, which reads them from then on too; raises what `read` raises."""
         self._read = read
         self._keep(read())
 
@@ -52,7 +52,7 @@ class KeyRing:
             await asyncio.sleep(REREAD_S)
 
     async def reread(self) -> None:
-        """Read the keys again; where that fails those known stay, for a while."""
+        """Read the keys again; where that fails, those read last count for `GRACE_S`."""
         try:
             records = await run_sync(self._read)
         except Exception as error:  # whatever it is, the next try may succeed
@@ -70,43 +70,43 @@ class KeyRing:
             self.by_id = {record.key_id: record for record in records}
         self._read_at = self._clock()
 
-    def needed(self, path: str) -> KeyScope | None:
+    def scope_for(self, path: str) -> KeyScope | None:
         """The scope that a decoded path needs now; None: no key is asked.
 
         Raises:
-            UnavailableError: One may be, but the keys have not been known for too long.
+            UnavailableError: A key may be needed, but for too long the keys could not be read.
         """
-        is_known = self._clock() - self._read_at <= KEPT_S
+        is_known = self._clock() - self._read_at <= GRACE_S
         if is_known and not self.by_id:
             return None
-        needed = needed_scope(path)
-        if needed is not None and not is_known:
+        required_scope = needed_scope(path)
+        if required_scope is not None and not is_known:
             raise UnavailableError("the keys cannot be read, so nobody can be let in; try again")
-        return needed
+        return required_scope
 
     def still_opens(self, key_id: str | None) -> bool:
-        """Whether a request let in with a key (None: while no key was asked) would be let in now; for long answers."""
+        """Whether a request let in with this key (None: without any) would be let in now; asked during long answers."""
         if key_id is None:
             return not self.by_id
         record = self.by_id.get(key_id)
         return record is not None and record.is_usable(now())
 
     def holder(self, presented: str) -> KeyRecord:
-        """The key that was presented; raises UnauthorizedError for one that is none, unknown, revoked or expired."""
+        """The key presented as text; raises UnauthorizedError where it is malformed, unknown, revoked or expired."""
         key = ApiKey.parse(presented)
         if key is None:
-            raise UnauthorizedError(f"the key is malformed: {_HOW}")
+            raise UnauthorizedError(f"the key is malformed: {_KEY_HELP}")
         record = self.by_id.get(key.key_id)
         # Always one comparison, so that its time does not tell which ids exist.
         is_right = hmac.compare_digest(key.secret_sha256, _NO_DIGEST if record is None else record.secret_sha256)
         if record is None or not is_right:
             raise UnauthorizedError("the key is not known here")
         if not record.is_usable(now()):  # told to its holder alone
-            what = "expired" if record.revoked_at is None else "was revoked"
-            raise UnauthorizedError(f"the key {what}: ask the operator for another", key_id=record.key_id)
+            reason = "expired" if record.revoked_at is None else "was revoked"
+            raise UnauthorizedError(f"the key {reason}: ask the operator for another", key_id=record.key_id)
         return record
 
-    def admit(self, scope: Scope, needed: KeyScope, rate_limit: "RateLimit") -> None:
+    def admit(self, scope: Scope, required_scope: KeyScope, rate_limit: "RateLimit") -> None:
         """Let a request in, and note whose it is; raises UnauthorizedError, RateLimitedError, ForbiddenError."""
         state = scope["state"]
         try:
@@ -116,13 +116,15 @@ class KeyRing:
             raise
         state |= {"key_id": key.key_id, "key_scope": key.scope, "domains": key.domains}
         rate_limit.take(key.key_id)
-        check_reach(key, scope["path"], needed)
+        check_reach(key, scope["path"], required_scope)
 
 
-def check_reach(key: KeyRecord, path: str, needed: KeyScope) -> None:
-    """Raise ForbiddenError where a key has not the scope that is needed, or a decoded path is of another's domain."""
-    if not key.scope.includes(needed):
-        raise ForbiddenError(f"this call needs a key of scope {needed}; this one has {key.scope}", needed=needed.value)
+def check_reach(key: KeyRecord, path: str, required_scope: KeyScope) -> None:
+    """Raise ForbiddenError where a key lacks the required scope, or a decoded path is of a domain it is not for."""
+    if not key.scope.includes(required_scope):
+        raise ForbiddenError(
+            f"this call needs a key of scope {required_scope}; this one has {key.scope}", needed=required_scope.value
+        )
     of_domain = _OF_DOMAIN.match(path)
     if key.domains is not None and of_domain is not None and of_domain[1] not in key.domains:
         raise ForbiddenError("this key is for other domains", domains=list(key.domains))
@@ -143,15 +145,15 @@ def presented_key(scope: Scope) -> str:
     authorizations = [value.partition(b" ") for name, value in headers if name == b"authorization"]
     # Another scheme is someone else's, a proxy's say.
     bearer = [text.strip(b" ") for scheme, _, text in authorizations if scheme.lower() == b"bearer"]
-    own = [value.strip(b" ") for name, value in headers if name == b"x-api-key"]
-    if not bearer and not own:
-        raise UnauthorizedError(f"no key came: {_HOW}")
-    if len(authorizations) > 1 or len(own) > 1 or len({*bearer, *own}) > 1:
+    api_keys = [value.strip(b" ") for name, value in headers if name == b"x-api-key"]
+    if not bearer and not api_keys:
+        raise UnauthorizedError(f"no key came: {_KEY_HELP}")
+    if len(authorizations) > 1 or len(api_keys) > 1 or len({*bearer, *api_keys}) > 1:
         raise UnauthorizedError("more than one key came: send one")
     try:
-        return (bearer or own)[0].decode("ascii")
+        return (bearer or api_keys)[0].decode("ascii")
     except UnicodeDecodeError as error:
-        raise UnauthorizedError(f"the key is malformed: {_HOW}") from error
+        raise UnauthorizedError(f"the key is malformed: {_KEY_HELP}") from error
 
 
 class RateLimit:
@@ -170,11 +172,11 @@ class RateLimit:
         """Count a request of a key; raises RateLimitedError, which counts nothing."""
         if self._per_s == 0:
             return
-        at = self._clock()
-        tokens, since = self.buckets.pop(key_id, (self._burst, at))
-        tokens = min(self._burst, tokens + (at - since) * self._per_s)
+        now_s = self._clock()
+        tokens, last_s = self.buckets.pop(key_id, (self._burst, now_s))
+        tokens = min(self._burst, tokens + (now_s - last_s) * self._per_s)
         is_allowed = tokens >= 1
-        self.buckets[key_id] = (tokens - 1 if is_allowed else tokens, at)
+        self.buckets[key_id] = (tokens - 1 if is_allowed else tokens, now_s)
         if len(self.buckets) > MAX_BUCKETS:
             self.buckets.popitem(last=False)
         if not is_allowed:

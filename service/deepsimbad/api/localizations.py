@@ -24,13 +24,13 @@ from deepsimbad.api.requests import (
     LandmarkModelTag,
     QuickRoute,
     Services,
-    insisted_on,
     media_type_of,
     parse_json,
     prefers,
     read_bytes,
+    required_tags,
 )
-from deepsimbad.api.scenes import MOST_PARTS, TOLD, TOLD_BODIES, TOLD_SCHEMA, scene_in
+from deepsimbad.api.scenes import MOST_PARTS, SCENE_BODIES, SCENE_MEMBERS, SCENE_SCHEMA, scene_in
 from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
@@ -55,7 +55,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 
-PROBABLY = 0.5
+WARNING_PROBABILITY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"], route_class=QuickRoute)
 
 MAX_LANDMARKS = 0xFFFF
@@ -78,7 +78,7 @@ class ObservationBody(JsonBody):
     text: Any = None
 
 
-def only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
+def list_schema(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
     """The schema of an object with one list of numbers."""
     values = {"type": "array", "items": items, "minItems": 1, "maxItems": MAX_NUMBERS, "description": description}
     return {"type": "object", "required": [name], "properties": {name: values}, "additionalProperties": False}
@@ -86,14 +86,14 @@ def only(name: str, items: dict[str, Any], description: str) -> dict[str, Any]:
 
 IMAGE_SCHEMA: dict[str, Any] = {"type": "string", "format": "binary"}
 _FORMS = (
-    only(
+    list_schema(
         "ranked_landmarks",
         {"type": "integer", "minimum": 0, "maximum": MAX_LANDMARKS - 1},
         "Distinct landmark ids from 0, nearest first, 1..r of them; the rest are farther.",
     ),
-    only("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
-    only("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
-    TOLD_SCHEMA,
+    list_schema("dissimilarities", {"type": "number"}, "r finite numbers in landmark order, smaller is nearer."),
+    list_schema("encoding", {"type": "number"}, "A ready encoding, as long as those the map was made of."),
+    SCENE_SCHEMA,
 )
 _RANKS_SCHEMA: dict[str, Any] = {
     **IMAGE_SCHEMA,
@@ -110,14 +110,14 @@ MADE_ON_BOARD: dict[str, type[PackedRanks | PackedUnitEncoding]] = {
     RANKS: PackedRanks,
     UNIT_ENCODING: PackedUnitEncoding,
 }
-OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, *MADE_ON_BOARD, *TOLD_BODIES)
+OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, *MADE_ON_BOARD, *SCENE_BODIES)
 
 
-def observation_body(beside: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The body of an observation in the OpenAPI document; members `beside` the view in a JSON body, by schema."""
-    forms = [{**form, "properties": {**form["properties"], **(beside or {})}} for form in _FORMS]
+def observation_body(extra_members: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The body of an observation in the OpenAPI document; a JSON body has `extra_members` too, by schema."""
+    forms = [{**form, "properties": {**form["properties"], **(extra_members or {})}} for form in _FORMS]
     packed = {RANKS: _RANKS_SCHEMA, UNIT_ENCODING: _UNIT_ENCODING_SCHEMA}
-    return declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, **packed, **TOLD_BODIES})
+    return declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, **packed, **SCENE_BODIES})
 
 
 OBSERVATION_BODY = observation_body()
@@ -125,7 +125,7 @@ Shortlist = Annotated[
     int | None, Query(ge=1, le=GREATEST_ID, description="Length of `retrieval` and `top`; absent: 10 or all.")
 ]
 
-# Answers: plain dictionaries, because there are some forty in one of them, made for every view
+# Answers: plain dictionaries, because every answer to a view holds some forty of them
 
 
 FrameName = Annotated[str | None, Field(description="What the map image is called in its recording.")]
@@ -248,29 +248,29 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64], is_confident:
     values = unknown if plan.values is None else plan.values.tolist()
     bits = unknown if plan.bits is None else plan.bits.tolist()
     actions: list[ActionAnswer] = []
-    for action_m, value, expected in zip(actions_m.tolist(), values, bits, strict=True):
-        actions.append({"action_m": action_m, "q_value": value, "expected_bits": expected})
+    for action_m, value, expected_bits in zip(actions_m.tolist(), values, bits, strict=True):
+        actions.append({"action_m": action_m, "q_value": value, "expected_bits": expected_bits})
     return {"planner": plan.planner, "action_m": plan.action_m, "stop": is_confident, "actions": actions}
 
 
 def warnings_of(is_informative: bool, belief: BeliefSummary) -> list[str]:
-    """What a person should know of an answer."""
+    """Warnings for a person, in sentences, about an answer."""
     warnings = [] if is_informative else ["the view told nothing of the place"]
-    if belief.off_route > PROBABLY:
+    if belief.off_route > WARNING_PROBABILITY:
         warnings.append(f"the robot is probably off the route, or was carried: off_route is {belief.off_route:.2f}")
     return warnings
 
 
 def render_belief(snapshot: Map, belief: BeliefSummary, is_confident: bool) -> BeliefAnswer:
-    """A belief, with the coordinates of its likeliest places."""
+    """The answer's form of a belief, with the coordinates of its likeliest places."""
     route, ids, top = snapshot.route, belief.top, list[PlaceAnswer]()
     coordinates = []
     for metres in (route.x_m, route.y_m):
-        shown = np.full(ids.size, None)
+        column = np.full(ids.size, None)
         if metres is not None:
             is_known = np.isfinite(metres[ids])
-            shown[is_known] = metres[ids][is_known]
-        coordinates.append(shown)
+            column[is_known] = metres[ids][is_known]
+        coordinates.append(column)
     columns = (ids, snapshot.frames[ids], route.position_m[ids], *coordinates, belief.top_mass)
     for image, frame, at_m, x, y, mass in zip(*map(np.ndarray.tolist, columns), strict=True):
         top.append({"map_image": image, "frame": frame, "route_position_m": at_m, "x_m": x, "y_m": y, "mass": mass})
@@ -321,7 +321,7 @@ async def post_localization(
     snapshot = active.snapshot
     media_type = media_type_of(request, OBSERVATION_TYPES)
     shortlist_length(snapshot, shortlist)  # a bad query should not cost an upload
-    landmark_models = None if if_match is None else insisted_on(if_match)
+    landmark_models = None if if_match is None else required_tags(if_match)
     body = await read_bytes(request)
     watch.lap("receive")
     evaluator = running.evaluators.evaluator(active.record.evaluator)
@@ -345,9 +345,9 @@ async def post_localization(
         record = await run_sync(running.catalog.domain, domain)  # as it is now
         anchor = record.options.get("anchor")
         mode = int(localization.belief.top[0])
-        posed = render_geopose(snapshot, None if anchor is None else AnchorBody(**anchor), mode)
-        return Response(to_json(posed), media_type=GEOPOSE)
-    answer, body = await running.written(
+        geopose = render_geopose(snapshot, None if anchor is None else AnchorBody(**anchor), mode)
+        return Response(to_json(geopose), media_type=GEOPOSE)
+    answer, body = await running.render_json(
         localization.belief.top.size, render_localization, localization, watch, remarks
     )
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
@@ -362,29 +362,29 @@ async def view_in(
     snapshot: Map,
     observation: ObservationBody | None = None,
 ) -> tuple[View, list[str]]:
-    """The observation in a body that has been read, and what a person should know of its picture.
+    """The view in a body, and remarks for a person on its picture.
 
-    An image comes at its evaluator's size, shown by its map's grey levels.
+    An image is returned at its evaluator's size, shown by its map's grey levels.
 
     Args:
-        observation: What a JSON body holds, where that is known.
+        observation: The JSON body where it has been parsed already.
     """
     document: dict[str, Any] = {}
     if media_type == JSON:
         observation = observation or await parse_json(body, ObservationBody, running)
-        given = observation.model_fields_set & ObservationBody.model_fields.keys()
-        is_told = bool(given) and given <= TOLD
-        if not is_told and len(given) != 1:
+        members = observation.model_fields_set & ObservationBody.model_fields.keys()
+        is_scene = bool(members) and members <= SCENE_MEMBERS
+        if not is_scene and len(members) != 1:
             raise invalid_body(
                 "give exactly one of ranked_landmarks, dissimilarities, encoding; or objects, text, or both"
             )
-        if "ranked_landmarks" in given:
+        if "ranked_landmarks" in members:
             return RankedLandmarks(observation.ranked_landmarks), []
-        if "dissimilarities" in given:
+        if "dissimilarities" in members:
             return Dissimilarities(np.array(observation.dissimilarities, np.float64)), []
-        if "encoding" in given:
+        if "encoding" in members:
             return ReadyEncoding(np.array(observation.encoding, np.float64)), []
-        document = observation.model_dump(include=set(TOLD))
+        document = observation.model_dump(include=set(SCENE_MEMBERS))
     if media_type in MADE_ON_BOARD:
         return MADE_ON_BOARD[media_type](body), []
     levels = levels_in(snapshot.landmark_model)
@@ -392,8 +392,8 @@ async def view_in(
         scene, picture = await scene_in(
             body, media_type, document, running, evaluator, Priority.LIVE, levels, snapshot.cameras
         )
-        seen = [] if picture is None else picture.remarks
-        return NothingSeen() if scene.is_blank else scene, [*scene.remarks, *seen]
+        picture_remarks = [] if picture is None else picture.remarks
+        return NothingSeen() if scene.is_blank else scene, [*scene.remarks, *picture_remarks]
     decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels, snapshot.cameras)
     return NothingSeen() if decoded.is_blank else decoded.image, decoded.remarks
 

@@ -17,7 +17,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from deepsimbad.api.problems import declare_json, problems
 from deepsimbad.api.requests import (
     GREATEST_ID,
-    KEPT,
+    REVALIDATE,
     Answer,
     DomainName,
     JsonBody,
@@ -141,7 +141,7 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
     It is read against its digest before the first byte is sent; `Repr-Digest` and `ETag` tell that digest.
     """
 
-    def checked() -> tuple[Path, str, int]:
+    def check() -> tuple[Path, str, int]:
         record = running.catalog.map(domain, version)
         if record.removed_at is not None:
             raise removed(domain, version)
@@ -153,20 +153,20 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
             raise unreadable(running.catalog, domain, version) from error
         return path, record.sha256, path.stat().st_size
 
-    path, sha256, n_bytes = await run_sync(checked)
+    path, sha256, n_bytes = await run_sync(check)
     etag = f'"sha256:{sha256}"'
     if names(request.headers.get("if-none-match"), etag):
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**KEPT, "ETag": etag})
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**REVALIDATE, "ETag": etag})
     request.scope["headers"] = one_range(request.scope["headers"], n_bytes)
     repr_digest = base64.b64encode(bytes.fromhex(sha256)).decode()
-    headers = {**KEPT, "ETag": etag, "Repr-Digest": f"sha-256=:{repr_digest}:"}
+    headers = {**REVALIDATE, "ETag": etag, "Repr-Digest": f"sha-256=:{repr_digest}:"}
     return FileResponse(path, headers=headers, media_type=MEDIA_TYPE, filename=f"{domain}-{version:06d}.sqlite")
 
 
 def one_range(headers: Headers, n_bytes: int) -> Headers:
-    """A request's headers without a Range that is none, or more than one: those are answered with the whole file.
+    """A request's headers, without a Range that is malformed or names several: that is answered with the whole file.
 
-    Raises HTTPException, 416, for one that begins behind the end.
+    Raises HTTPException, 416, for a range that begins behind the end.
     """
     range_header = next((value.decode("latin-1").replace(" ", "") for name, value in headers if name == b"range"), "")
     match = _RANGE.fullmatch(range_header)

@@ -36,7 +36,7 @@ from deepsimbad.release import release
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState, MapRecord
 
-# A gauge beside every counter that says when it began: nobody asks.
+# Else a gauge beside every counter would say when the counter began, which nobody asks.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 GATE_LOST = "gate_lost"  # sealed, but worse than the active map by more than its gate allowed
@@ -51,9 +51,9 @@ class Metrics:
     """The service's counters, all named `deepsimbad_...`.
 
     Attributes:
-        request_began: Counts a request as being answered.
-        committed: Takes the number of writes in one transaction of the sessions' file.
-        map_store_failing: Takes whether a map store cannot be followed now.
+        request_began: Call it as a request's answer begins.
+        committed: Call it with the number of writes in one transaction of the sessions' file.
+        map_store_failing: Call it with whether the map store cannot be followed now.
     """
 
     def __init__(self) -> None:
@@ -65,38 +65,40 @@ class Metrics:
         def histogram(name: str, meaning: str, buckets: Sequence[float], *labels: str) -> Histogram:
             return Histogram(f"deepsimbad_{name}", meaning, labels, buckets=buckets, registry=self._registry)
 
-        # Looked up in a cache of our own, series cost half as much.
+        # A cache of ours makes looking a series up half as costly.
         self._requests = cache(counter("requests", "Requests answered.", "method", "route", "status").labels)
-        what = "Time from a request's head to the end of its answer."
-        self._request_seconds = cache(histogram("request_seconds", what, _LATENCY_BUCKETS_S, "route").labels)
-        what = "Time of the stages of one answer to a view, and their total."
-        self._stage_seconds = cache(histogram("localization_stage_seconds", what, _LATENCY_BUCKETS_S, "stage").labels)
-        what = "Entropy of the belief after one view: high when the map no longer tells places apart."
-        self._entropy_bits = histogram("belief_entropy_bits", what, range(0, 25, 2), "domain")
-        what = "Normalised rank of the true map image in a session's belief, in percent, once the truth was told: "
-        what += "0 is perfect, 50 chance."
-        self._live_anr_percent = histogram("live_anr_percent", what, _PERCENT_BUCKETS, "domain")
-        what = "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong."
-        self._observations = counter("observations", what, "outcome")
-        what = "Writes that shared one transaction of the sessions' file."
-        self.committed = histogram("session_commit_writes", what, _BATCH_BUCKETS).observe
-        what = "Requests turned away for what they are or how many, by reason."
-        self._refused = counter("refused_requests", what, "reason")
-        what = "Time from a job's start to its end."
-        self._job_seconds = histogram("job_seconds", what, _JOB_BUCKETS_S, "kind", "state")
+        meaning = "Time from a request's head to the end of its answer."
+        self._request_seconds = cache(histogram("request_seconds", meaning, _LATENCY_BUCKETS_S, "route").labels)
+        meaning = "Time of the stages of one answer to a view, and their total."
+        self._stage_seconds = cache(
+            histogram("localization_stage_seconds", meaning, _LATENCY_BUCKETS_S, "stage").labels
+        )
+        meaning = "Entropy of the belief after one view: high when the map no longer tells places apart."
+        self._entropy_bits = histogram("belief_entropy_bits", meaning, range(0, 25, 2), "domain")
+        meaning = "Normalised rank of the true map image in a session's belief, in percent, once the truth was told: "
+        meaning += "0 is perfect, 50 chance."
+        self._live_anr_percent = histogram("live_anr_percent", meaning, _PERCENT_BUCKETS, "domain")
+        meaning = "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong."
+        self._observations = counter("observations", meaning, "outcome")
+        meaning = "Writes that shared one transaction of the sessions' file."
+        self.committed = histogram("session_commit_writes", meaning, _BATCH_BUCKETS).observe
+        meaning = "Requests turned away for what they are or how many, by reason."
+        self._refused = counter("refused_requests", meaning, "reason")
+        meaning = "Time from a job's start to its end."
+        self._job_seconds = histogram("job_seconds", meaning, _JOB_BUCKETS_S, "kind", "state")
         self._in_flight = Gauge(
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
         self.request_began = self._in_flight.inc
-        what = "1 where the map store could not be followed the last time."
-        self.map_store_failing = Gauge("deepsimbad_map_store_failing", what, registry=self._registry).set
+        meaning = "1 where the map store could not be followed the last time."
+        self.map_store_failing = Gauge("deepsimbad_map_store_failing", meaning, registry=self._registry).set
         ProcessCollector(registry=self._registry)
         self._state: StateCollector | None = None
         self._domains: set[str] = set()  # that have series here
         self._scrape = threading.Lock()
 
     def watch(self, state: "StateCollector") -> None:
-        """Show this state too, from now on."""
+        """Expose this state too, from now on."""
         self._state = state
         self._registry.register(state)
 
@@ -109,7 +111,7 @@ class Metrics:
     def localized(
         self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float, outcome: str | None = None
     ) -> None:
-        """Record one answer to a view; of a session's with its outcome, as `observed` takes it."""
+        """Record one answer to a view; for a session's view with its outcome, as `observed` takes it."""
         if outcome is not None:
             self._observations.labels(outcome).inc()
         for stage, milliseconds in timings_ms.items():
@@ -118,7 +120,7 @@ class Metrics:
         self._entropy_bits.labels(domain).observe(entropy_bits)
 
     def fed_back(self, domain: str, rank_shares: Iterable[float]) -> None:
-        """Record where beliefs had placed the truth: shares of the map, 0..1, one for every observation."""
+        """Record the ranks of the truth in beliefs, as shares of the map, 0..1, one for every observation."""
         self._domains.add(domain)
         ranks = self._live_anr_percent.labels(domain)
         for share in rank_shares:
@@ -129,15 +131,15 @@ class Metrics:
         self._observations.labels(outcome).inc()
 
     def refused(self, reason: str) -> None:
-        """Count what was turned away: an error's code, or the setting whose limit was met."""
+        """Count a request turned away; `reason` is the error's code, or the setting whose limit was met."""
         self._refused.labels(reason).inc()
 
     def job_ended(self, kind: str, state: str, seconds: float) -> None:
-        """Record how long a job ran until it ended so."""
+        """Record how long a job ran until it ended in this state."""
         self._job_seconds.labels(kind, state).observe(seconds)
 
     def forget_domain(self, domain: str) -> None:
-        """Drop what is kept by a domain's name, so that deleted domains do not pile up."""
+        """Drop the series of a domain, so that those of deleted domains do not pile up."""
         self._domains.discard(domain)
         for histogram in (self._entropy_bits, self._live_anr_percent):
             histogram.remove_by_labels({"domain": domain})
@@ -154,9 +156,9 @@ class Metrics:
 
 @dataclass(eq=False)
 class StateCollector(Collector):
-    """Gives what `look` saw, and nothing of the scrape before, so that series of deleted domains end.
+    """Collects what `look` read, and nothing of the scrape before, so that series of deleted domains end.
 
-    `_faults` tells what keeps the service from being ready.
+    `_faults` returns what keeps the service from being ready.
     """
 
     _catalog: Catalog
@@ -172,10 +174,10 @@ class StateCollector(Collector):
         """Read the catalog for the next `collect`; the names of its domains, None where it cannot be read."""
         try:
             domains, self._jobs = self._catalog.domain_names(), self._catalog.jobs()
-            # Of a hundred thousand domains nobody could take in the series: those that are asked have them.
+            # Nobody could read the series of a hundred thousand domains: those whose maps are in memory have them.
             damaged = self._maps.damaged()  # asked first: one that is back is in memory then
-            shown = {mapped.record.name for mapped in self._maps.loaded()} | damaged.keys()
-            self._serving = self._catalog.serving_maps(shown & domains)
+            series_domains = {mapped_domain.record.name for mapped_domain in self._maps.loaded()} | damaged.keys()
+            self._serving = self._catalog.serving_maps(series_domains & domains)
         except DeepSimbadError:  # `deepsimbad_ready` tells; what needs no catalog is shown all the same
             self._n_domains = None
             return None
@@ -183,9 +185,9 @@ class StateCollector(Collector):
         return domains
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        """Every family."""
-        about = {(release(), platform.python_version()): 1}
-        yield _gauge("build_info", "Always 1; the labels tell the release.", about, "version", "python")
+        """All families of gauges."""
+        build = {(release(), platform.python_version()): 1}
+        yield _gauge("build_info", "Always 1; the labels tell the release.", build, "version", "python")
         yield _gauge("ready", "1 where /readyz answers 200.", {(): not self._faults()})
         yield _gauge("inference_queue", "Work waiting for the inference worker.", {(): self._worker.n_waiting})
         yield _gauge("loaded_maps", "Active maps held in memory.", {(): self._maps.n_loaded})
@@ -208,7 +210,7 @@ class StateCollector(Collector):
         yield _gauge("map_age_seconds", "Time since the map that serves was built.", ages_s, "domain")
         is_damaged = {(domain,): damaged.get(domain) == record.version for domain, record in serving}
         yield _gauge("map_damaged", "1 where the map that serves could not be loaded.", is_damaged, "domain")
-        snapshots = {(mapped.snapshot.domain,): mapped.snapshot for mapped in self._maps.loaded()}
+        snapshots = {(mapped_domain.snapshot.domain,): mapped_domain.snapshot for mapped_domain in self._maps.loaded()}
         n_images = {domain: snapshot.route.n_images for domain, snapshot in snapshots.items()}
         yield _gauge("map_images", "Map images of the map in memory.", n_images, "domain")
         n_bytes = {domain: snapshot.index_bytes for domain, snapshot in snapshots.items()}
@@ -218,14 +220,18 @@ class StateCollector(Collector):
         n_jobs = CountOf(job.state for job in self._jobs)
         by_state = {(state.value,): n_jobs[state] for state in JobState}
         yield _gauge("jobs", "Jobs the catalog knows, by state.", by_state, "state")
-        # They are done one after the other as they came, whatever the clock was set to; one that was cancelled while it
-        # waited, out of that order, tells of nothing that was done and counts only beside others such.
-        ended = [job for job in self._jobs if job.kind == REMAP and job.finished_at is not None]
-        last = sorted({job.domain: job for job in sorted(ended, key=lambda job: job.n_starts > 0)}.items())
-        outcomes = {(domain, outcome): outcome == _outcome(job) for domain, job in last for outcome in REMAP_OUTCOMES}
-        what = "1 for the outcome of the remap that ended last, else 0."
-        yield _gauge("last_remap", what, outcomes, "domain", "outcome")
-        ended_at = {(domain,): _seconds(job.finished_at or "") for domain, job in last}
+        # Jobs run one after the other as they came, whatever the clock was set to. One cancelled while it waited is out
+        # of that order and did nothing: it counts only where no remap of the domain ever ran.
+        ended_remaps = [job for job in self._jobs if job.kind == REMAP and job.finished_at is not None]
+        last_remaps = sorted(
+            {job.domain: job for job in sorted(ended_remaps, key=lambda job: job.n_starts > 0)}.items()
+        )
+        outcomes = {
+            (domain, outcome): outcome == _outcome(job) for domain, job in last_remaps for outcome in REMAP_OUTCOMES
+        }
+        meaning = "1 for the outcome of the remap that ended last, else 0."
+        yield _gauge("last_remap", meaning, outcomes, "domain", "outcome")
+        ended_at = {(domain,): _seconds(job.finished_at or "") for domain, job in last_remaps}
         yield _gauge("last_remap_timestamp_seconds", "When it ended, seconds since 1970.", ended_at, "domain")
 
 
@@ -239,7 +245,7 @@ def _seconds(iso: str) -> float:
 
 
 def _gauge(name: str, meaning: str, values: Mapping[Any, float], *labels: str) -> GaugeMetricFamily:
-    """A family of gauges, its values by those of its labels."""
+    """A family of gauges, of values by the values of their labels."""
     family = GaugeMetricFamily(f"deepsimbad_{name}", meaning, labels=labels)
     for label_values, value in values.items():
         family.add_metric(label_values, int(value) if isinstance(value, bool) else value)

@@ -14,10 +14,10 @@ from deepsimbad.release import release
 
 router = APIRouter(include_in_schema=False, route_class=StrictRoute)
 
-_KEPT = {"Cache-Control": "public, max-age=3600"}
+_CACHE_AN_HOUR = {"Cache-Control": "public, max-age=3600"}
 
 
-# Where to go from here
+# The root page
 
 _LINKS = {
     "console": "console",
@@ -80,7 +80,7 @@ async def calls() -> Response:
 @router.get("/docs/start.js")
 async def calls_start() -> Response:
     """What draws the page."""
-    return Response(_CALLS_START, media_type="text/javascript", headers=_KEPT)
+    return Response(_CALLS_START, media_type="text/javascript", headers=_CACHE_AN_HOUR)
 
 
 @router.get("/docs/{asset}")
@@ -88,7 +88,7 @@ async def calls_asset(
     name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], PathParameter(alias="asset")],
 ) -> Response:
     """Swagger UI, from the package that brings it."""
-    return FileResponse(Path(str(resources.files("fastapi_offline") / "static")) / name, headers=_KEPT)
+    return FileResponse(Path(str(resources.files("fastapi_offline") / "static")) / name, headers=_CACHE_AN_HOUR)
 
 
 # The console

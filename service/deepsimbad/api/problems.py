@@ -109,9 +109,9 @@ def error_response(scope: Scope, error: DeepSimbadError) -> Response:
     status = status_of(error)
     if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, OverloadedError):
         # What stands behind a 503 helps; where nothing does its sentence says all, and a probe repeats it all night.
-        is_told = status == HTTPStatus.SERVICE_UNAVAILABLE and error.__cause__ is None
-        about = {"request_id": scope.get("state", {}).get("request_id"), "code": error.code, "why": error.message}
-        log.warning("not answered", exc_info=None if is_told else error, extra=about)
+        is_complete = status == HTTPStatus.SERVICE_UNAVAILABLE and error.__cause__ is None
+        log_fields = {"request_id": scope.get("state", {}).get("request_id"), "code": error.code, "why": error.message}
+        log.warning("not answered", exc_info=None if is_complete else error, extra=log_fields)
     summary = (type(error).__doc__ or "").strip().partition("\n")[0].rstrip(".")
     retry_after_s = error.hints.get("retry_after_s")
     headers = None if retry_after_s is None else {"Retry-After": str(retry_after_s)}
@@ -124,23 +124,27 @@ def unexpected_response(scope: Scope) -> Response:
     return problem_response(scope, HTTPStatus.INTERNAL_SERVER_ERROR, "internal_error", detail)
 
 
-def invalid_request(findings: Sequence[Any], *where: str) -> InvalidRequestError:
-    """The tree's error, of up to 20 findings, for what pydantic refused; `where` begins every place ("body")."""
+def invalid_request(findings: Sequence[Any], *prefix: str) -> InvalidRequestError:
+    """The tree's error for up to 20 findings of pydantic; `prefix` begins the location of each, as "body"."""
     errors = [  # pydantic puts its own words before those of our validators
-        {"loc": [*where, *finding["loc"]], "msg": finding["msg"].removeprefix("Value error, "), "type": finding["type"]}
+        {
+            "loc": [*prefix, *finding["loc"]],
+            "msg": finding["msg"].removeprefix("Value error, "),
+            "type": finding["type"],
+        }
         for finding in findings[:20]
     ]
     place = ".".join(str(part) for part in errors[0]["loc"])
     return InvalidRequestError(f"{place}: {errors[0]['msg']}", errors=errors)
 
 
-def invalid_body(what: str, kind: str = "value_error") -> InvalidRequestError:
-    """The same for what no model tells."""
-    return InvalidRequestError(f"body: {what}", errors=[{"loc": ["body"], "msg": what, "type": kind}])
+def invalid_body(complaint: str, kind: str = "value_error") -> InvalidRequestError:
+    """The tree's error for a body that no pydantic model refused."""
+    return InvalidRequestError(f"body: {complaint}", errors=[{"loc": ["body"], "msg": complaint, "type": kind}])
 
 
 def install_problem_handlers(app: FastAPI) -> None:
-    """Let every error that leaves a route of `app` be answered as a problem."""
+    """Answer every error that leaves a route of `app` as a problem."""
 
     async def from_tree(request: Request, error: Any) -> Response:
         return error_response(request.scope, error)
@@ -206,7 +210,7 @@ _RETRY_AFTER = {"Retry-After": {"description": "Seconds to wait.", "schema": {"t
 _CHALLENGE = {"WWW-Authenticate": {"description": "How to authenticate.", "schema": {"const": "Bearer"}}}
 _HEADERS = {401: _CHALLENGE, 429: _RETRY_AFTER, 503: _RETRY_AFTER}
 _DOMAIN = {"domain": "$request.path.domain"}
-# What an answer gives to the calls whose path needs just these: call, status, parameters.
+# A call, the status of its answer, and the path parameters that this answer gives to other calls.
 _LINKS = (
     ("PUT /v1/admin/domains/{domain}", "201", _DOMAIN),
     ("POST /v1/admin/domains/{domain}/traverses", "201", _DOMAIN | {"name": "$response.body#/name"}),
@@ -285,9 +289,9 @@ def binary(description: str) -> dict[str, Any]:
     return {"application/octet-stream": {"schema": {"type": "string", "format": "binary", "description": description}}}
 
 
-def location(status: int, what: str) -> dict[int | str, dict[str, Any]]:
-    """The `responses` of a route whose answer says where what was made is."""
-    return {status: {"headers": {"Location": {"description": what, "schema": {"type": "string"}}}}}
+def location(status: int, description: str) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route whose answer has a `Location` header, which `description` describes."""
+    return {status: {"headers": {"Location": {"description": description, "schema": {"type": "string"}}}}}
 
 
 def declare_json(model: type[BaseModel]) -> dict[str, Any]:
@@ -344,11 +348,11 @@ def _complete(document: dict[str, Any]) -> None:
         for method, operation in by_method.items()
     }
     for name, operation in operations.items():
-        if told := operation.get("description"):  # in place of a function's name: the first sentence, or clause
-            operation["summary"] = re.split(r"[.;:](?:\s|$)", " ".join(told.split()), maxsplit=1)[0] + "."
-        needed = needed_scope(name.partition(" ")[2])
-        if needed is not None:
-            operation["security"] = [{scheme: [needed.value]} for scheme in _SECURITY_SCHEMES]
+        if description := operation.get("description"):  # in place of a function's name: the first sentence, or clause
+            operation["summary"] = re.split(r"[.;:](?:\s|$)", " ".join(description.split()), maxsplit=1)[0] + "."
+        required_scope = needed_scope(name.partition(" ")[2])
+        if required_scope is not None:
+            operation["security"] = [{scheme: [required_scope.value]} for scheme in _SECURITY_SCHEMES]
             for refusal in (401, 403, 429):
                 operation["responses"].setdefault(str(refusal), _problem(refusal))
         operation["responses"] = dict(sorted(operation["responses"].items()))
@@ -366,7 +370,7 @@ def _complete(document: dict[str, Any]) -> None:
 
 
 def _link(operations: Mapping[str, dict[str, Any]]) -> None:
-    """Say of the answers that make something which calls take it."""
+    """Link answers to the calls whose path parameters they give."""
     for source, status, parameters in _LINKS:
         links = operations[source]["responses"][status].setdefault("links", {})
         for target, operation in operations.items():
@@ -384,7 +388,7 @@ def _problem(status: int) -> dict[str, Any]:
 
 
 def _write_pairs_plainly(schema: Any) -> None:
-    """Write arrays of so many items of one kind with `items`: many readers of such documents know no `prefixItems`."""
+    """Write tuples of one kind of item with `items`, in place: many readers of the document know no `prefixItems`."""
     if isinstance(schema, dict):
         kinds = schema.get("prefixItems")
         if isinstance(kinds, list) and all(kind == kinds[0] for kind in kinds):

@@ -57,7 +57,7 @@ T = TypeVar("T")
 JSON = "application/json"
 BINARY = "application/octet-stream"
 # As programs spell types that have another name; what an image is its first bytes say anyway.
-_SPELT_OTHERWISE = {
+_MEDIA_TYPE_ALIASES = {
     **dict.fromkeys(("image/jpg", "image/pjpeg", "image/x-jpeg"), "image/jpeg"),
     **dict.fromkeys(("image/tif", "image/x-tif", "image/x-tiff"), "image/tiff"),
     "image/x-png": "image/png",
@@ -76,35 +76,35 @@ _MAX_PARTS = 1000  # members, texts, lists: far more than any body here has
 
 
 class Slots:
-    """Room for `most` of something at once: `what` as a sentence names it, `setting` allows more."""
+    """Room for `capacity` of something at once, which `phrase` names in a sentence; `setting` allows more."""
 
-    def __init__(self, most: int, what: str, setting: str) -> None:
-        self.most = most
+    def __init__(self, capacity: int, phrase: str, setting: str) -> None:
+        self.capacity = capacity
         self.n_taken = 0
-        self._what = what
+        self._phrase = phrase
         self._setting = setting
 
     def check(self, n: int = 1) -> None:
-        """Raise OverloadedError where there is no room for so many more."""
-        if self.n_taken + n > self.most:
+        """Raise OverloadedError where there is no room for `n` more."""
+        if self.n_taken + n > self.capacity:
             raise OverloadedError(
-                f"{self.n_taken} {self._what} and no more are taken: try again in a moment",
+                f"{self.n_taken} {self._phrase} and no more are taken: try again in a moment",
                 retry_after_s=1,
                 limit=self._setting,
             )
 
     def take(self, n: int = 1) -> None:
-        """Take room; raises OverloadedError where there is none."""
-        if self.n_taken + n > self.most:
+        """Take room for `n`; raises OverloadedError where there is none."""
+        if self.n_taken + n > self.capacity:
             self.check(n)
         self.n_taken += n
 
     def give_back(self, n: int = 1) -> None:
-        """Give back what was taken."""
+        """Give back the room for `n`."""
         self.n_taken -= n
 
     @contextmanager
-    def taken(self) -> Iterator[None]:
+    def slot(self) -> Iterator[None]:
         """Room for one inside the block; raises OverloadedError."""
         self.take()
         try:
@@ -120,9 +120,9 @@ class Services:
     Attributes:
         faults: What keeps the service from being ready, a sentence each; may wait for the disk.
         stopping: Set when shutdown begins; streams end on it.
-        newest_jobs: As `Catalog.newest_jobs`, of all catalogs that one answers for.
+        newest_jobs: As `Catalog.newest_jobs`, over all catalogs that this service answers for.
         owners: Who has the domains where one view is asked of many; None: `atlas` does.
-        spools: How much waits to be fitted, and may.
+        spools: How many bytes of pictures wait to be fitted, and how many may.
         batches: The thread that reads batches into memory.
         long_work: The thread that reads long bodies and writes long answers: two would end no sooner.
         health: Threads for questions about health, which should not wait behind what they ask about.
@@ -158,8 +158,8 @@ class Services:
 
     async def active(self, domain: str) -> MappedDomain:
         """A domain and its active map; files are read in a thread."""
-        mapped = self.maps.peek(domain)
-        return mapped if mapped is not None else await run_sync(self.maps.active, domain)
+        mapped_domain = self.maps.peek(domain)
+        return mapped_domain if mapped_domain is not None else await run_sync(self.maps.active, domain)
 
     async def encoded(self, evaluator: Evaluator, view: View) -> View:
         """An `EncodedImage` in the place of an image or a scene; other views as they are."""
@@ -167,15 +167,15 @@ class Services:
             return await encoded(self.worker, evaluator, view)
         return view
 
-    async def written(self, n_listed: int, render: Callable[..., T], *given: Any) -> tuple[T, bytes]:
-        """What `render` makes of what is given, and its JSON, without checking again what we computed.
+    async def render_json(self, n_listed: int, render: Callable[..., T], *arguments: Any) -> tuple[T, bytes]:
+        """The answer that `render` makes of the arguments, and its JSON, which is not checked again.
 
-        An answer whose longest list, of `n_listed`, is long is written beside the event loop.
+        An answer whose longest list, of `n_listed` entries, is long is written beside the event loop.
         """
         if n_listed > LONG_LIST:
-            answer = await run_sync(render, *given, limiter=self.long_work)
+            answer = await run_sync(render, *arguments, limiter=self.long_work)
             return answer, await run_sync(to_json, answer, limiter=self.long_work)
-        answer = render(*given)
+        answer = render(*arguments)
         return answer, to_json(answer)
 
 
@@ -203,49 +203,52 @@ def prefers(request: Request, media_type: str) -> bool:
 class StrictRoute(APIRoute):
     """A route that refuses query parameters which it does not take; raises UnknownParameterError."""
 
-    def __init__(self, *given: Any, **more: Any) -> None:
-        super().__init__(*given, **more)
-        taken = get_flat_params(self.dependant)
-        self.queries = tuple(each.alias for each in taken if isinstance(each.field_info, params.Query))
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        fields = get_flat_params(self.dependant)
+        self.queries = tuple(field.alias for field in fields if isinstance(field.field_info, params.Query))
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The framework's, after a look at the query."""
+        """Answer as the framework does, once the query is known to hold no unknown parameter."""
         unknown = Request(scope).query_params.keys() - self.queries
         if unknown and scope["method"] in (self.methods or ()):
-            named = sorted(name[:_LONGEST_NAME] for name in unknown)
-            what = nearest_of(named[0], self.queries) if self.queries else ": this call takes none"
-            what = f"there is no query parameter {named[0]}{what}"
-            raise UnknownParameterError(what, unknown=named[:_MOST_NAMES], allowed=list(self.queries))
+            unknown_names = sorted(name[:_LONGEST_NAME] for name in unknown)
+            hint = nearest_of(unknown_names[0], self.queries) if self.queries else ": this call takes none"
+            raise UnknownParameterError(
+                f"there is no query parameter {unknown_names[0]}{hint}",
+                unknown=unknown_names[:_MOST_NAMES],
+                allowed=list(self.queries),
+            )
         await super().handle(scope, receive, send)
 
 
 class QuickRoute(StrictRoute):
     """A route whose parameters are read by one validator; what that does not take the framework refuses, by name.
 
-    Of routes that depend on nothing and answer by a response of their own. The framework's way, a parameter at a time,
-    is a fifth of what the event loop does for an observation.
+    For routes without dependencies that return a response of their own. The framework reads one parameter at a time,
+    which is a fifth of what the event loop does for an observation.
     """
 
-    def __init__(self, *given: Any, **more: Any) -> None:
-        super().__init__(*given, **more)
-        taken = self.dependant
-        fields = [*taken.path_params, *taken.query_params, *taken.header_params]
-        typed: dict[str, Any] = {each.name: (each.field_info.annotation, each.field_info) for each in fields}
-        self._kind = None if taken.dependencies else create_model("Parameters", **typed)
-        self._headers = [(each.alias, each.alias.lower().encode()) for each in taken.header_params]
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        dependant = self.dependant
+        fields = [*dependant.path_params, *dependant.query_params, *dependant.header_params]
+        definitions: dict[str, Any] = {field.name: (field.field_info.annotation, field.field_info) for field in fields}
+        self._kind = None if dependant.dependencies else create_model("Parameters", **definitions)
+        self._headers = [(field.alias, field.alias.lower().encode()) for field in dependant.header_params]
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The framework's, with a shorter way before it."""
-        given = dict[str, Any](parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
+        """Answer with the parameters that the validator took, else as the framework does."""
+        texts = dict[str, Any](parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
         parameters: dict[str, Any] | None = None
-        if self._kind is not None and scope["method"] in (self.methods or ()) and not given.keys() - self.queries:
-            given |= scope["path_params"]
-            sent = dict(reversed(scope["headers"]))  # the first of several counts
+        if self._kind is not None and scope["method"] in (self.methods or ()) and not texts.keys() - self.queries:
+            texts |= scope["path_params"]
+            headers = dict(reversed(scope["headers"]))  # the first of several counts
             for alias, name in self._headers:
-                if name in sent:
-                    given[alias] = sent[name].decode("latin-1")
+                if name in headers:
+                    texts[alias] = headers[name].decode("latin-1")
             with suppress(ValidationError):
-                parameters = vars(self._kind.model_validate(given))
+                parameters = vars(self._kind.model_validate(texts))
         if parameters is None:
             await super().handle(scope, receive, send)
         else:
@@ -273,7 +276,7 @@ class Page(NamedTuple):
 
     @property
     def number(self) -> int | None:
-        """The key, of a list of numbers."""
+        """The key as a number, for a list whose keys are numbers."""
         return None if self.key is None else int(self.key)
 
     def next(self, last_key: int | str | None) -> Next:
@@ -281,17 +284,20 @@ class Page(NamedTuple):
         return None if last_key is None else f"{self.list_name}-{last_key}"
 
 
-def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$", usual: int = 100) -> Any:
-    """The parameters `limit`, usually so many, and `after` of a list, as a `Page`."""
-    cursor = f"^{list_name}-{key_pattern}"
+def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$", default_limit: int = 100) -> Any:
+    """The query parameters `limit` and `after` of a list, as a `Page`."""
+    cursor_pattern = f"^{list_name}-{key_pattern}"
 
     async def page(
-        limit: Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")] = usual,
-        after: Annotated[
-            str | None, Query(pattern=cursor, description="`next` of the page before; absent: the first page.")
+        limit: Annotated[int, Query(ge=1, le=1000, description="Most entries of the answer.")] = default_limit,
+        cursor: Annotated[
+            str | None,
+            Query(
+                alias="after", pattern=cursor_pattern, description="`next` of the page before; absent: the first page."
+            ),
         ] = None,
     ) -> Page:
-        return Page(list_name, limit, None if after is None else after.removeprefix(f"{list_name}-"))
+        return Page(list_name, limit, None if cursor is None else cursor.removeprefix(f"{list_name}-"))
 
     return Depends(page)
 
@@ -300,8 +306,8 @@ def page_of(list_name: str, key_pattern: str = "[0-9]{1,18}$", usual: int = 100)
 
 _TAG = r'(?:W/)?"[\x21\x23-\x7e]*"'
 _STRONG = re.compile(r'(W/)?"([\x21\x23-\x7e]*)"')
-KEPT = {"Cache-Control": "private, no-cache"}
-"""What is named by a tag may be kept by who asked, and asked for again: a domain made anew counts its versions anew."""
+REVALIDATE = {"Cache-Control": "private, no-cache"}
+"""Headers of tagged content: a client may keep it but must ask again, for a domain made anew counts versions anew."""
 LandmarkModelTag = Annotated[
     str | None,
     Header(
@@ -318,8 +324,8 @@ def names(header: str | None, etag: str) -> bool:
     return header is not None and any(tag.strip().removeprefix("W/") in {etag, "*"} for tag in header.split(","))
 
 
-def insisted_on(header: str) -> frozenset[str] | None:
-    """The contents, one of which an If-Match insists on; None: any will do. Weak tags match nothing."""
+def required_tags(header: str) -> frozenset[str] | None:
+    """The tags, one of which an If-Match requires; None: any content will do. Weak tags match nothing."""
     if header.strip() == "*":
         return None
     return frozenset(tag for weak, tag in _STRONG.findall(header) if not weak)
@@ -330,9 +336,9 @@ def insisted_on(header: str) -> frozenset[str] | None:
 KeyWord = Annotated[str, Field(pattern=r"^[\x21-\x7e]{1,255}$")]
 
 
-def idempotency_header(what_again: str) -> Any:
+def idempotency_header(consequence: str) -> Any:
     """The header `Idempotency-Key`, described."""
-    return Header(alias="Idempotency-Key", description=f"The same key with the same {what_again}")
+    return Header(alias="Idempotency-Key", description=f"The same key with the same {consequence}")
 
 
 KeyOfCreation = Annotated[
@@ -395,10 +401,10 @@ def media_type_of(request: Request, allowed: tuple[str, ...]) -> str:
     """The body's media type, without parameters; raises UnsupportedMediaTypeError for none, or one not allowed."""
     header = request.headers.get("content-type")
     media_type = (header or "").partition(";")[0].strip().lower()
-    media_type = _SPELT_OTHERWISE.get(media_type, media_type)
+    media_type = _MEDIA_TYPE_ALIASES.get(media_type, media_type)
     if media_type not in allowed:
-        what = f"Content-Type {media_type[:100]!r} is not taken" if header else "the request has no Content-Type"
-        raise UnsupportedMediaTypeError(f"{what}; send one of {', '.join(allowed)}", allowed=list(allowed))
+        complaint = f"Content-Type {media_type[:100]!r} is not taken" if header else "the request has no Content-Type"
+        raise UnsupportedMediaTypeError(f"{complaint}; send one of {', '.join(allowed)}", allowed=list(allowed))
     return media_type
 
 
@@ -434,7 +440,7 @@ async def parse_json(body: bytes, kind: type[Body], running: Services) -> Body:
         return kind.model_validate_json(document)
     except ValidationError as error:
         raise invalid_request(
-            [_with_nearest(each, kind) for each in error.errors(include_url=False)], "body"
+            [_with_nearest(finding, kind) for finding in error.errors(include_url=False)], "body"
         ) from error
     except (RecursionError, OverflowError, ValueError) as error:
         raise InvalidRequestError("body: not JSON that can be read") from error

@@ -11,7 +11,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad.evaluators.scenes import FORM_DATA, LONGEST_LABEL, LONGEST_TEXT, MOST_OBJECTS, TEXT, Scene
 
-TOLD = frozenset({"objects", "text"})  # members of a JSON body
+SCENE_MEMBERS = frozenset({"objects", "text"})  # members of a JSON body
 MOST_PARTS = 100_000  # of a body of objects: far more than are taken, so that it is their number that is refused
 
 _SHARE = {"type": "number", "minimum": 0, "maximum": 1}
@@ -33,14 +33,14 @@ _OBJECT = {
 }
 _OBJECTS = {"type": "array", "items": _OBJECT, "maxItems": MOST_OBJECTS}
 _TEXT = {"type": "string", "minLength": 1, "maxLength": LONGEST_TEXT, "pattern": r"\S"}
-TOLD_SCHEMA: dict[str, Any] = {
+SCENE_SCHEMA: dict[str, Any] = {
     "type": "object",
     "anyOf": [{"required": ["objects"]}, {"required": ["text"]}],
     "properties": {"objects": _OBJECTS, "text": _TEXT},
     "additionalProperties": False,
     "description": "What a detector found (none: the view tells nothing), and what is seen in words, where taken.",
 }
-TOLD_BODIES: dict[str, dict[str, Any]] = {
+SCENE_BODIES: dict[str, dict[str, Any]] = {
     TEXT: {**_TEXT, "description": "What is seen, in words, where the domain takes them."},
     FORM_DATA: {
         "type": "object",
@@ -60,13 +60,13 @@ async def scene_in(
     levels: GreyLevels | None,
     cameras: Sequence[Camera] = (),
 ) -> tuple[Scene, Decoded | None]:
-    """What a body tells, and the image in it.
+    """The scene in a body, and the image in it, decoded.
 
     Args:
-        document: The members of a JSON body, read.
+        document: The members of a JSON body, parsed.
 
     Raises:
-        InvalidSceneError: It tells nothing that can be read.
+        InvalidSceneError: The body holds no scene that can be read.
         UnsupportedMediaTypeError: The evaluator does not take it in this form; and as `Decoders.decoded`.
     """
     image: bytes | None = None

@@ -34,14 +34,14 @@ _N_STANDARD = len(logging.makeLogRecord({}).__dict__)
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
 
 
-def _given(record: logging.LogRecord) -> dict[str, Any]:
-    """What was given as `extra`, behind what every record has; libraries mark their own by an underscore."""
-    behind = islice(record.__dict__.items(), _N_STANDARD, None)
-    return {name: value for name, value in behind if name not in _STANDARD and not name.startswith("_")}
+def _extras(record: logging.LogRecord) -> dict[str, Any]:
+    """The `extra` fields of a record, without those of libraries, which begin with an underscore."""
+    items = islice(record.__dict__.items(), _N_STANDARD, None)
+    return {name: value for name, value in items if name not in _STANDARD and not name.startswith("_")}
 
 
 class JsonFormatter(logging.Formatter):
-    """One line a record: time, level, logger, message, and whatever was given as `extra`."""
+    """One line a record: time, level, logger, message, and the `extra` fields."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Render a record."""
@@ -51,21 +51,21 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        line |= _given(record)
+        line |= _extras(record)
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return _ENCODER.encode(line)
 
 
 class PlainFormatter(logging.Formatter):
-    """One line a record for a person at a terminal: time, level where it is no news, message, what was given beside."""
+    """One line a record for a person at a terminal: time, level above INFO, message, `extra` fields."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Render a record."""
-        told = [f"{name}={value}" for name, value in _given(record).items() if value not in (None, {}, [])]
+        fields = [f"{name}={value}" for name, value in _extras(record).items() if value not in (None, {}, [])]
         level = "" if record.levelno <= logging.INFO else f"{record.levelname}: "
-        at = time.strftime("%H:%M:%S", time.localtime(record.created))
-        line = "  ".join([f"{at}  {level}{record.getMessage()}", *told])
+        clock_time = time.strftime("%H:%M:%S", time.localtime(record.created))
+        line = "  ".join([f"{clock_time}  {level}{record.getMessage()}", *fields])
         return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
 
@@ -80,7 +80,7 @@ def configure_logging(level: str) -> None:
     As JSON lines; where that is a terminal, as a person reads them.
     """
     form = PlainFormatter if sys.stderr.isatty() else JsonFormatter
-    # No line of ours tells these, and every record would look them up.
+    # No line of ours shows these, and every record would look them up.
     logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
     if sys.version_info >= (3, 12):
         logging.logAsyncioTasks = False
@@ -103,14 +103,14 @@ def configure_logging(level: str) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Says when it listens, and tells the application of shutdown, so that event streams do not hold it up."""
+    """Logs that it listens, and tells the application of a shutdown, so that event streams do not hold it up."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
         self._app = app
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal came: finish what is under way; a second one does not wait."""
+        """Finish the requests under way and stop; after a second signal stop at once."""
         services = getattr(self._app.state, "services", None)
         if services is not None:
             services.stopping.set()
@@ -127,15 +127,15 @@ class _Server(uvicorn.Server):
         gc.collect()
         gc.freeze()  # what is there stays, and looking through it again would stop all answers for a tenth of a second
         sys.setswitchinterval(_LONGEST_HOLD_S)
-        addresses = [listening.getsockname()[:2] for server in self.servers for listening in server.sockets]
+        addresses = [listener.getsockname()[:2] for server in self.servers for listener in server.sockets]
         host, port = addresses[0]
-        reached = "localhost" if host in {"0.0.0.0", "::"} else f"[{host}]" if ":" in host else host  # noqa: S104
-        url = f"{'https' if self.config.is_ssl else 'http'}://{reached}:{port}"
+        url_host = "localhost" if host in {"0.0.0.0", "::"} else f"[{host}]" if ":" in host else host  # noqa: S104
+        url = f"{'https' if self.config.is_ssl else 'http'}://{url_host}:{port}"
         pages = {"console": f"{url}/console", "docs": f"{url}/docs"}
         log.info("ready", extra={"addresses": [f"{host}:{port}" for host, port in addresses], "url": url, **pages})
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End connections and requests, then the application: also where nobody waits, its files are closed."""
+        """End connections and requests, then the application, whose files are closed even where nobody waits."""
         await super().shutdown(sockets)
         if self.force_exit:
             for task in self.server_state.tasks:
@@ -144,7 +144,7 @@ class _Server(uvicorn.Server):
 
 
 def http_config(app: Callable[..., Any], settings: Settings) -> uvicorn.Config:
-    """How an application of ASGI's is served over HTTP; raises SettingsError where the TLS files are unusable."""
+    """How an ASGI application is served over HTTP; raises SettingsError where the TLS files are unusable."""
     config = uvicorn.Config(
         app,
         host=settings.host,
@@ -176,9 +176,9 @@ def http_config(app: Callable[..., Any], settings: Settings) -> uvicorn.Config:
     return config
 
 
-def cannot_listen(settings: Settings, why: OSError) -> UnavailableError:
-    """What to raise where the address is taken, or is none of this machine's."""
-    reason = (why.strerror or str(why)).rpartition("): ")[2]  # asyncio repeats the address
+def cannot_listen(settings: Settings, error: OSError) -> UnavailableError:
+    """The error for an address that is in use, or is not one of this machine's."""
+    reason = (error.strerror or str(error)).rpartition("): ")[2]  # asyncio repeats the address
     return UnavailableError(
         f"cannot listen on {settings.host}:{settings.port}: {reason}; --host and --port name another address"
     )
@@ -193,7 +193,7 @@ def serve(settings: Settings, create: bool = False) -> None:
 
     Raises:
         SettingsError: It would be open to other machines, the data directory is not there, or TLS files are unusable.
-        DeepSimbadError: What kept it from starting, by name.
+        DeepSimbadError: It could not start; the error names the cause.
     """
     if not catalog_path(settings.data_dir).is_file():  # then there is no key, and no need to make the folder first
         settings.check_exposure(n_keys=0)
@@ -204,18 +204,18 @@ def serve(settings: Settings, create: bool = False) -> None:
             setting="data_dir",
         )
     configure_logging(settings.log_level)
-    changed = {  # none of them is a secret
+    changed_settings = {  # none of them is a secret
         name: str(value) if isinstance(value, Path) else value
         for name, field in Settings.model_fields.items()
         if name != "data_dir" and (value := getattr(settings, name)) != field.default
     }
-    where = str(settings.data_dir.resolve())
-    log.info("starting", extra={"version": release(), "data_dir": where, "settings": changed})
+    data_dir = str(settings.data_dir.resolve())
+    log.info("starting", extra={"version": release(), "data_dir": data_dir, "settings": changed_settings})
     app = create_app(settings)
     config = http_config(app, settings)
 
     def is_news(record: logging.LogRecord) -> bool:
-        """Whoever called gets the named error; its stack in the log would only hide it."""
+        """Whether a record is no stack trace of a named error, which the caller gets anyway."""
         return not (hasattr(app.state, "startup_error") and record.getMessage().startswith("Traceback"))
 
     logging.getLogger("uvicorn.error").addFilter(is_news)
@@ -225,8 +225,8 @@ def serve(settings: Settings, create: bool = False) -> None:
         with threadpool_limits(1, user_api="blas"):
             _Server(config, app).run()
     except SystemExit as ended:  # how uvicorn says that it could not start
-        why = ended.__context__
-        if isinstance(why, OSError):
-            raise cannot_listen(settings, why) from why
-        unforeseen = UnavailableError("the service could not start: the log says why")
-        raise getattr(app.state, "startup_error", unforeseen) from ended
+        cause = ended.__context__
+        if isinstance(cause, OSError):
+            raise cannot_listen(settings, cause) from cause
+        unexplained = UnavailableError("the service could not start: the log says why")
+        raise getattr(app.state, "startup_error", unexplained) from ended

@@ -48,13 +48,13 @@ from deepsimbad.api.requests import (
     StrictRoute,
     id_under_key,
     idempotency_header,
-    insisted_on,
     key_id_of,
     media_type_of,
     page_of,
     prefers,
     read_bytes,
     read_json,
+    required_tags,
     robot_of,
 )
 from deepsimbad.core.belief.particles import FilterKind
@@ -100,7 +100,7 @@ class SessionBody(JsonBody):
     ] = None
 
     def config(self) -> SessionConfig:
-        """The engine's form."""
+        """The configuration as the engine takes it."""
         return SessionConfig(**{name: value for name, value in self if value is not None})
 
 
@@ -226,9 +226,9 @@ def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer
     }
 
 
-def render_listed(listed: ListedSession) -> ListedSessionAnswer:
-    """A session in a list."""
-    answer = vars(listed.session) | {"n_observations": listed.n_observations}
+def render_listed(listed_session: ListedSession) -> ListedSessionAnswer:
+    """The answer's form of a session in a list."""
+    answer = vars(listed_session.session) | {"n_observations": listed_session.n_observations}
     times = {name: _iso(answer[name]) for name in ("created_at", "expires_at")}
     return ListedSessionAnswer.model_validate(answer | times)
 
@@ -237,9 +237,11 @@ def _iso(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-async def _answered(running: Services, view: SessionView, status: int = 200, location: str | None = None) -> Response:
+async def _session_response(
+    running: Services, view: SessionView, status: int = 200, location: str | None = None
+) -> Response:
     headers = None if location is None else {"Location": location}
-    _, body = await running.written(view.belief.top.size, render_session, view)
+    _, body = await running.render_json(view.belief.top.size, render_session, view)
     return Response(body, status, headers, JSON)
 
 
@@ -261,7 +263,7 @@ async def post_session(
     config = (await read_json(request, SessionBody)).config()
     session_id = id_under_key(request, "session", domain, idempotency_key)
     view = await running.sessions.begin(active, config, session_id, key_id_of(request))
-    return await _answered(running, view, 201, f"/v1/sessions/{view.session_id}")
+    return await _session_response(running, view, 201, f"/v1/sessions/{view.session_id}")
 
 
 @router.post(
@@ -300,20 +302,20 @@ async def post_observation(
         media_type = media_type_of(request, OBSERVATION_TYPES)
         body = await read_bytes(request)
         watch.lap("receive")
-        named = None
+        idempotency = None
         if idempotency_key is not None:
             query = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
-            named = IdempotencyKey(idempotency_key, hashlib.sha256(query + body).digest())
+            idempotency = IdempotencyKey(idempotency_key, hashlib.sha256(query + body).digest())
         decode = partial(view_in, body, running, media_type)
-        models = None if if_match is None else insisted_on(if_match)
-        observation = Observation(decode, action_m, action_std_m, shortlist, named, models)
+        landmark_models = None if if_match is None else required_tags(if_match)
+        observation = Observation(decode, action_m, action_std_m, shortlist, idempotency, landmark_models)
         view = await running.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
         running.metrics.observed(error.code)
         raise
     if media_type in MEDIA_TYPES and await _keeps_pictures(running, view.snapshot.domain):
         running.pictures.saw(session_id, body)
-    answer, body = await running.written(view.belief.top.size, render_observation, view, watch)
+    answer, body = await running.render_json(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
     running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
@@ -321,7 +323,7 @@ async def post_observation(
 
 
 async def _keeps_pictures(running: Services, domain: str) -> bool:
-    """As its options say; where no map answers any more there is nothing to look beside."""
+    """Whether a domain keeps small pictures; False where it has no map that answers."""
     try:
         return bool((await running.active(domain)).record.options.get("thumbnails"))
     except DeepSimbadError:
@@ -333,7 +335,7 @@ async def get_session(
     session_id: SessionId, request: Request, running: Running, shortlist: Shortlist = None
 ) -> Response:
     """A session as it stands; asking does not keep it from expiring."""
-    return await _answered(running, await running.sessions.view(session_id, shortlist, robot_of(request)))
+    return await _session_response(running, await running.sessions.view(session_id, shortlist, robot_of(request)))
 
 
 @router.get(
@@ -351,7 +353,9 @@ async def get_belief(
     if prefers(request, BINARY):
         return npy_response(await running.sessions.mass(session_id, robot_of(request)))
     view = await running.sessions.view(session_id, shortlist, robot_of(request))
-    _, body = await running.written(view.belief.top.size, render_belief, view.snapshot, view.belief, view.is_confident)
+    _, body = await running.render_json(
+        view.belief.top.size, render_belief, view.snapshot, view.belief, view.is_confident
+    )
     return Response(body, media_type=JSON)
 
 
@@ -372,7 +376,7 @@ async def put_prior(session_id: SessionId, request: Request, running: Running) -
     """Replace the belief by one around a position: the robot was carried, or got a fix."""
     body = await read_json(request, PriorBody)
     view = await running.sessions.set_prior(session_id, body.position_m, body.std_m, robot_of(request))
-    return await _answered(running, view)
+    return await _session_response(running, view)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=problems(404, 410, 422))
@@ -391,17 +395,17 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
     session; the metric `deepsimbad_live_anr_percent` counts every observation once.
     """
     body = await read_json(request, TruthsBody)
-    ranked, before_m = await running.truths.keep(
+    ranking, before_m = await running.truths.keep(
         session_id, body.true_positions_m, body.true_map_images, body.first_observation, robot_of(request)
     )
-    await run_sync(running.metrics.fed_back, ranked.session.domain, ranked.new_since(before_m).tolist())
-    ranks = None if ranked.retrieval_rank is None else ranked.retrieval_rank[ranked.first :].tolist()
+    await run_sync(running.metrics.fed_back, ranking.session.domain, ranking.new_since(before_m).tolist())
+    ranks = None if ranking.retrieval_rank is None else ranking.retrieval_rank[ranking.first :].tolist()
     return TruthsAnswer(
-        n_scored=ranked.n_scored,
-        n_left_out=ranked.n_left_out,
-        anr=ranked.anr,
+        n_scored=ranking.n_scored,
+        n_left_out=ranking.n_left_out,
+        anr=ranking.anr,
         retrieval_ranks=None if ranks is None else [None if math.isnan(rank) else rank for rank in ranks],
-        map_version=ranked.session.map_version,
+        map_version=ranking.session.map_version,
     )
 
 

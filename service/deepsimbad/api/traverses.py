@@ -150,24 +150,24 @@ async def list_traverses(
     """The traverses of a domain, by name."""
     data_dir = running.settings.data_dir
 
-    def described() -> TraverseList:
+    def describe() -> TraverseList:
         running.catalog.domain(domain)
         names = [name for name in Traverse.list(data_dir, domain) if name > (page.key or "")]
-        listed = ListPage.of(((name, name) for name in names), page.limit)
+        name_page = ListPage.of(((name, name) for name in names), page.limit)
         answers = []
-        for name in listed.records:  # a file each, so that those of other pages stay closed
+        for name in name_page.records:  # a file each, so that those of other pages stay closed
             with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, name) as traverse:
                 answers.append(TraverseAnswer.model_validate(traverse.summary()))
-        return TraverseList(traverses=answers, next=page.next(listed.last_key))
+        return TraverseList(traverses=answers, next=page.next(name_page.last_key))
 
-    return await run_sync(described)
+    return await run_sync(describe)
 
 
 @router.get("/{name}", responses=problems(404, 422))
 async def get_traverse(domain: DomainName, name: TraverseName, running: Running) -> TraverseAnswer:
     """What has arrived of a traverse, and which of its frames are missing."""
 
-    def described() -> TraverseAnswer:
+    def describe() -> TraverseAnswer:
         running.catalog.domain(domain)
         data_dir = running.settings.data_dir
         with Traverse.open(data_dir, domain, name) as traverse:
@@ -177,12 +177,12 @@ async def get_traverse(domain: DomainName, name: TraverseName, running: Running)
             camera = None
             with suppress(UnknownTraverseError):
                 camera = None if other == name else Traverse.main_camera(data_dir, domain, other)
-            whose = f"those of traverse {other}"
-            if camera is not None and (why := summary.cameras[0].unlike([camera], whose)) is not None:
-                warnings.append(f"its pictures are not like {whose}: {why}")
+            other_pictures = f"those of traverse {other}"
+            if camera is not None and (difference := summary.cameras[0].unlike([camera], other_pictures)) is not None:
+                warnings.append(f"its pictures are not like {other_pictures}: {difference}")
         return TraverseAnswer.model_validate(replace(summary, warnings=tuple(warnings)))
 
-    return await run_sync(described)
+    return await run_sync(describe)
 
 
 @router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
@@ -191,8 +191,8 @@ async def delete_traverse(domain: DomainName, name: TraverseName, running: Runni
 
     def delete() -> None:
         for job in running.catalog.jobs(domain):
-            needed = {job.config.get(role) for role in TRAVERSE_ROLES}
-            if name in needed and not job.state.is_final:
+            traverse_names = {job.config.get(role) for role in TRAVERSE_ROLES}
+            if name in traverse_names and not job.state.is_final:
                 raise TraverseInUseError(
                     f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
                 )

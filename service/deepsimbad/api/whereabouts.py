@@ -13,7 +13,7 @@ from typing_extensions import TypedDict
 from deepsimbad.api.localizations import (
     MADE_ON_BOARD,
     OBSERVATION_TYPES,
-    PROBABLY,
+    WARNING_PROBABILITY,
     BeliefAnswer,
     NextBestViewAnswer,
     ObservationBody,
@@ -34,10 +34,10 @@ from deepsimbad.api.requests import (
     Running,
     Services,
     StrictRoute,
-    insisted_on,
     media_type_of,
     parse_json,
     read_bytes,
+    required_tags,
 )
 from deepsimbad.engine.atlas import MOST_IN_FULL, Part, Whereabouts, whereabouts
 from deepsimbad.engine.localizer import DEFAULT_SHORTLIST, Localization
@@ -138,19 +138,19 @@ class WhereaboutsAnswer(TypedDict):
 
 
 def render_whereabouts(
-    found: Whereabouts, watch: Stopwatch, remarks: Sequence[str], n_top: int | None
+    posterior: Whereabouts, watch: Stopwatch, remarks: Sequence[str], n_top: int | None
 ) -> WhereaboutsAnswer:
-    """The answer; the watch runs since the request arrived."""
+    """The answer of a posterior over domains; the watch runs since the request arrived."""
     domains, places = list[LikelyDomainAnswer](), list[LikelyPlaceAnswer]()
-    for name, probability in found.probabilities.items():
-        likely: Any = found.likeliest[name]
+    for name, probability in posterior.probabilities.items():
+        likely: Any = posterior.likeliest[name]
         answer = render_localization(likely, watch) if isinstance(likely, Localization) else likely
         domains.append(
             {
                 "domain": name,
                 "map_version": answer["map_version"],
                 "probability": probability,
-                "log_evidence": found.log_evidences[name],
+                "log_evidence": posterior.log_evidences[name],
                 "belief": answer["belief"],
                 "informative": answer["informative"],
                 "retrieval": answer["retrieval"],
@@ -161,13 +161,13 @@ def render_whereabouts(
             places.append({**place, "domain": name, "mass": probability * place["mass"]})
     is_informative = bool(domains) and domains[0]["informative"]
     warnings = [*remarks] + ([] if is_informative else ["the view told nothing of the place"])
-    if found.elsewhere > PROBABLY:
-        warnings.append(f"the robot is probably on none of these routes: elsewhere is {found.elsewhere:.2f}")
-    left_out = list(found.left_out.items())
+    if posterior.elsewhere > WARNING_PROBABILITY:
+        warnings.append(f"the robot is probably on none of these routes: elsewhere is {posterior.elsewhere:.2f}")
+    left_out = list(posterior.left_out.items())
     return {
         "domains": domains,
-        "others": {"n_domains": found.n_others, "probability": found.of_others},
-        "elsewhere": found.elsewhere,
+        "others": {"n_domains": posterior.n_others, "probability": posterior.of_others},
+        "elsewhere": posterior.elsewhere,
         "top": nlargest(n_top or DEFAULT_SHORTLIST, places, key=lambda place: place["mass"]),
         "informative": is_informative,
         "warnings": warnings,
@@ -209,22 +209,22 @@ async def post_whereabouts(
     body = await read_bytes(request)
     watch.lap("receive")
     observation = await parse_json(body, WhereaboutsBody, running) if media_type == JSON else None
-    names, is_all = await _asked(request, running, domains, observation)
+    names, is_all = await _domain_names(request, running, domains, observation)
     owners = running.owners
     gathering = run_sync(running.atlas.gather, names, is_all) if owners is None else owners.gather(names, is_all)
-    there, left_out = await gathering
-    if if_match is not None and (tags := insisted_on(if_match)) is not None:
-        there, differing = await run_sync(_of_landmark_models, there, tags)
-        left_out |= differing
+    mapped_domains, left_out = await gathering
+    if if_match is not None and (tags := required_tags(if_match)) is not None:
+        mapped_domains, mismatches = await run_sync(_with_landmark_models, mapped_domains, tags)
+        left_out |= mismatches
     elif media_type in MADE_ON_BOARD or (
         observation and observation.model_fields_set & {"ranked_landmarks", "dissimilarities"}
     ):
-        await run_sync(_check_one_landmark_model, there)
+        await run_sync(_check_one_landmark_model, mapped_domains)
     watch.lap("maps")
     parts, remarks = [Part({}, {}, left_out)], list[str]()
-    for evaluator, members in _alike(running, there):
+    for evaluator, members in _encoding_groups(running, mapped_domains):
         try:
-            view, seen = await view_in(body, running, media_type, evaluator, members[0].snapshot, observation)
+            view, view_remarks = await view_in(body, running, media_type, evaluator, members[0].snapshot, observation)
             watch.lap("decode")
             view = await running.encoded(evaluator, view)
             watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
@@ -236,61 +236,65 @@ async def post_whereabouts(
         except DeepSimbadError as error:
             parts.append(Part({}, {}, {member.record.name: error for member in members}))
         else:
-            remarks += [remark for remark in seen if remark not in remarks]
+            remarks += [remark for remark in view_remarks if remark not in remarks]
         watch.lap("compare")
-    found = whereabouts(parts, in_full)
-    if not found.likeliest:
-        raise _nobody(found.left_out)
-    _, answer = await running.written(in_full * (shortlist or 1), render_whereabouts, found, watch, remarks, shortlist)
+    posterior = whereabouts(parts, in_full)
+    if not posterior.likeliest:
+        raise _no_answer(posterior.left_out)
+    _, answer = await running.render_json(
+        in_full * (shortlist or 1), render_whereabouts, posterior, watch, remarks, shortlist
+    )
     return Response(answer, media_type=JSON)
 
 
-async def _asked(
-    request: Request, running: Services, given: list[str] | None, observation: WhereaboutsBody | None
+async def _domain_names(
+    request: Request, running: Services, query_names: list[str] | None, observation: WhereaboutsBody | None
 ) -> tuple[list[str], bool]:
-    """The domains that are asked, by name, each once; and whether it is all that the key opens.
+    """The names of the domains that are asked, without repetitions, and whether these are all that the key opens.
 
     Raises:
         ForbiddenError: The key does not open one that was named.
     """
     in_body = observation is not None and "domains" in observation.model_fields_set
-    if in_body and given is not None:
+    if in_body and query_names is not None:
         raise invalid_body("domains stand in the body and in the query: name them once")
-    named: Any = observation.domains if in_body and observation else given or ALL
-    opened = request.scope["state"].get("domains")  # to this key; None: all
-    if ALL in named:
-        there = await run_sync(running.catalog.domain_names)
-        return sorted(there if opened is None else there & set(opened)), True
-    if opened is not None and not set(named) <= set(opened):
-        raise ForbiddenError("this key is for other domains", domains=list(opened))
-    return list(dict.fromkeys(named)), False
+    names: Any = observation.domains if in_body and observation else query_names or ALL
+    key_domains = request.scope["state"].get("domains")  # to this key; None: all
+    if ALL in names:
+        existing_names = await run_sync(running.catalog.domain_names)
+        return sorted(existing_names if key_domains is None else existing_names & set(key_domains)), True
+    if key_domains is not None and not set(names) <= set(key_domains):
+        raise ForbiddenError("this key is for other domains", domains=list(key_domains))
+    return list(dict.fromkeys(names)), False
 
 
-def _alike(running: Services, there: Sequence[MappedDomain]) -> list[tuple[Evaluator, list[MappedDomain]]]:
-    """The domains for which an image is decoded and encoded once."""
+def _encoding_groups(
+    running: Services, mapped_domains: Sequence[MappedDomain]
+) -> list[tuple[Evaluator, list[MappedDomain]]]:
+    """The domains, grouped by evaluator and kind of picture: for each group a view is decoded and encoded once."""
     groups: dict[Any, tuple[Evaluator, list[MappedDomain]]] = {}
-    for mapped in there:
-        evaluator = running.evaluators.evaluator(mapped.record.evaluator)
-        key = id(evaluator), str(levels_in(mapped.snapshot.landmark_model)), mapped.snapshot.cameras
-        groups.setdefault(key, (evaluator, []))[1].append(mapped)
+    for mapped_domain in mapped_domains:
+        evaluator = running.evaluators.evaluator(mapped_domain.record.evaluator)
+        key = id(evaluator), str(levels_in(mapped_domain.snapshot.landmark_model)), mapped_domain.snapshot.cameras
+        groups.setdefault(key, (evaluator, []))[1].append(mapped_domain)
     return list(groups.values())
 
 
-def _of_landmark_models(
-    there: Sequence[MappedDomain], tags: frozenset[str]
+def _with_landmark_models(
+    mapped_domains: Sequence[MappedDomain], tags: frozenset[str]
 ) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
-    same, left_out = list[MappedDomain](), dict[str, DeepSimbadError]()
-    for mapped in there:
+    matches, left_out = list[MappedDomain](), dict[str, DeepSimbadError]()
+    for mapped_domain in mapped_domains:
         try:
-            mapped.snapshot.check_landmark_model(tags)
-            same.append(mapped)
+            mapped_domain.snapshot.check_landmark_model(tags)
+            matches.append(mapped_domain)
         except LandmarkModelDiffersError as error:
-            left_out[mapped.record.name] = error
-    return same, left_out
+            left_out[mapped_domain.record.name] = error
+    return matches, left_out
 
 
-def _check_one_landmark_model(there: Sequence[MappedDomain]) -> None:
-    digests = {mapped.snapshot.landmark_model_digest for mapped in there}
+def _check_one_landmark_model(mapped_domains: Sequence[MappedDomain]) -> None:
+    digests = {mapped_domain.snapshot.landmark_model_digest for mapped_domain in mapped_domains}
     if len(digests) > 1:
         raise LandmarkModelDiffersError(
             f"what is made on board is of one landmark model, and these domains have {len(digests)}: name its digest "
@@ -299,7 +303,7 @@ def _check_one_landmark_model(there: Sequence[MappedDomain]) -> None:
         )
 
 
-def _nobody(left_out: Mapping[str, DeepSimbadError]) -> DeepSimbadError:
+def _no_answer(left_out: Mapping[str, DeepSimbadError]) -> DeepSimbadError:
     if len(left_out) == 1:
         return next(iter(left_out.values()))
     if not left_out:

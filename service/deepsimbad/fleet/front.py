@@ -18,7 +18,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from deepsimbad.api.door import FREE_BYTES, most_body_bytes
+from deepsimbad.api.door import FREE_BYTES, max_body_bytes
 from deepsimbad.api.keys import KeyRing, check_reach, presented_key
 from deepsimbad.api.problems import error_response
 from deepsimbad.api.requests import Slots
@@ -230,7 +230,7 @@ class Front:
     def _opens(self, scope: Scope) -> bool:
         """Whether the key that is presented, if one is asked, reaches so far."""
         try:
-            needed = self._keys.needed(scope["path"])
+            needed = self._keys.scope_for(scope["path"])
             if needed is not None:
                 check_reach(self._keys.holder(presented_key(scope)), scope["path"], needed)
         except (UnauthorizedError, ForbiddenError, UnavailableError):  # whoever is asked says so
@@ -262,7 +262,7 @@ class Bodies:
             ClientDisconnect: Its sender has gone before all of it had come.
         """
         headers = dict(scope["headers"])
-        most, is_batch = most_body_bytes(scope, headers, self._settings)
+        most, is_batch = max_body_bytes(scope, headers, self._settings)
         declared = headers.get(b"content-length", b"0")
         n_declared = int(declared[:20]) if declared.isdigit() else 0
         parts = _parts(scope, receive, most)
@@ -271,7 +271,7 @@ class Bodies:
         elif is_batch:
             folder = Path(tempfile.gettempdir())
             async with AsyncExitStack() as turn:
-                turn.enter_context(self._uploads.taken())
+                turn.enter_context(self._uploads.slot())
                 with storage_faults(folder), tempfile.TemporaryFile(dir=folder) as spool:
                     async for part in parts:
                         await asyncio.to_thread(spool.write, part)
@@ -297,7 +297,7 @@ class Bodies:
     def _is_let_in(self, scope: Scope) -> bool:
         """Whether a replica would read the body of who comes with this key; it judges all that a key is for."""
         try:
-            if self._keys.needed(scope["path"]) is not None:
+            if self._keys.scope_for(scope["path"]) is not None:
                 self._keys.holder(presented_key(scope))
         except UnauthorizedError:
             return False

@@ -21,7 +21,7 @@ from ray.serve.exceptions import RayServeException
 from ray.serve.handle import DeploymentHandle, DeploymentResponse
 from starlette.types import Message, Scope
 
-from deepsimbad.api.app import Elsewhere, create_app, follow
+from deepsimbad.api.app import Substitutes, create_app, follow
 from deepsimbad.api.localizations import render_localization
 from deepsimbad.api.requests import Services
 from deepsimbad.api.server import configure_logging
@@ -170,7 +170,7 @@ class Replica:
         self._parts = AsyncExitStack()
         self._watching = list[asyncio.Task[None]]()
         objects = Objects.open(str(settings.map_store))
-        elsewhere, jobs = Elsewhere(), AllJobs()
+        elsewhere, jobs = Substitutes(), AllJobs()
         if admin is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(admin.lives.remote(0), _START_S)
