@@ -10,8 +10,8 @@ import pytest
 from deepsimbad.evaluators.objects import ObjectLayouts
 from deepsimbad.evaluators.scenes import Objects, Scene
 from deepsimbad_client.errors import BrokenFrameError, SourceError
+from deepsimbad_client.recordings.annotations import as_taken
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.recordings.told import as_taken
 
 
 def test_detections_of_two_seasons_are_alike_at_a_place_and_differ_elsewhere(rendered):

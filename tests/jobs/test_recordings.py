@@ -17,8 +17,8 @@ from deepsimbad.jobs.experiments import kept as kept_module
 from deepsimbad.jobs.experiments.kept import kept_encodings
 from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad_client.recordings import Frame, Recording
+from deepsimbad_client.recordings.annotations import as_taken
 from deepsimbad_client.recordings.sources import open_source
-from deepsimbad_client.recordings.told import as_taken
 
 MAX_PIXELS = 1_000_000
 

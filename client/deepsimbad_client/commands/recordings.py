@@ -27,7 +27,14 @@ from deepsimbad_client.errors import UnknownDomainError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.upload import upload as upload_recording
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.options import accounting, opened, reading, rotate_option, tell_left_out, views
+from deepsimbad_client.recordings.options import (
+    accounting,
+    open_recording,
+    reading,
+    rotate_option,
+    tell_left_out,
+    views,
+)
 from deepsimbad_client.replay import DEFAULT_PLANNER, Viewer
 from deepsimbad_client.replay.active import EPISODES, STEPS, Stage, active_replay
 from deepsimbad_client.replay.passive import TOLERANCE_M
@@ -85,7 +92,7 @@ def upload(
     except UnknownDomainError:
         there = None
     closed = closed if there is None else there.closed
-    recording = opened(source, allow_missing, closed=closed, **reading)
+    recording = open_recording(source, allow_missing, closed=closed, **reading)
     if there is None:
         _make_domain(client, domain, recording, closed, evaluator, actions_m)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
@@ -237,7 +244,7 @@ def replay(
         raise click.UsageError(f"{', '.join(active_only)} belong to an active replay: give --planner too")
     if planners and tolerance_m is not None:
         raise click.UsageError("--tolerance belongs to a passive replay: an active one ranks the nearest map image")
-    recording = opened(source, allow_missing, **reading)
+    recording = open_recording(source, allow_missing, **reading)
     folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
     name = f"{recording.name} against {domain}"
     with ExitStack() as open_ones:
@@ -335,7 +342,7 @@ def watch(
         return
     if source is None or domain is None:
         raise click.UsageError("give SOURCE and --domain, or --session")
-    recording = opened(source, **reading)
+    recording = open_recording(source, **reading)
     tell_left_out(recording.left_out_names, recording.name, verbose=False)
     stage = Stage(client, recording, domain)
     watch_episode(stage, console, planner=planner, steps=steps, seed=seed, pause_s=pause_s)

@@ -16,7 +16,7 @@ from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, content_digest, di
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherFramesError, SourceError
 from deepsimbad_client.http.client import Client
 from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, shown, spread
-from deepsimbad_client.recordings.told import as_taken
+from deepsimbad_client.recordings.annotations import as_taken
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
 CONCURRENCY = 4
@@ -199,7 +199,7 @@ def _check_unsent(
 
     They must be equal by place and time, a few also by content.
     """
-    full, sent_indices = recording.whole or recording, {frame.index for frame in recording.frames}
+    full, sent_indices = recording.full_recording or recording, {frame.index for frame in recording.frames}
     unsent_rows = [row for row, index in enumerate(stored["index"].tolist()) if index not in sent_indices]
     if not unsent_rows:
         return
@@ -212,7 +212,7 @@ def _check_unsent(
         frames = [full.frames[row] for row in rest]
         encodings = None if full.encodings is None else full.encodings[rest]
         comparison = Comparison(
-            dataclasses.replace(full, frames=frames, encodings=encodings, whole=None), unsent_columns
+            dataclasses.replace(full, frames=frames, encodings=encodings, full_recording=None), unsent_columns
         )
         for _ in comparison.read_digests(input_size, 1, spread(len(rest))):
             pass

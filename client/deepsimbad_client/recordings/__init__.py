@@ -87,13 +87,13 @@ class Recording:
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
     n_before_slice: int | None = None  # how many frames there were before some were taken; None: all are
     camera: str | None = None  # what took the images, by its name
-    whole: "Recording | None" = None  # of whose frames these are a slice; None: these are all
+    full_recording: "Recording | None" = None  # of whose frames these are a slice; None: these are all
     tolerance_m: float | None = None  # within which papers on this set count a match as true; None: no known set
 
     @property
     def left_out(self) -> dict[str, int]:
         """Reason -> how many frames are not in `frames`."""
-        return counted(self.left_out_names)
+        return counts_of(self.left_out_names)
 
     @property
     def n_whole(self) -> int:
@@ -113,8 +113,8 @@ class Recording:
         """The recording shown by the grey levels of the traverse or the map that it goes to; None: by its own."""
         if levels is None:
             return self
-        whole = None if self.whole is None else self.whole.shown_by(levels)
-        return dataclasses.replace(self, grey_levels=levels, whole=whole)
+        full_recording = None if self.full_recording is None else self.full_recording.shown_by(levels)
+        return dataclasses.replace(self, grey_levels=levels, full_recording=full_recording)
 
     def stamp(self, frame: Frame) -> str:
         """What changes when a frame's image does: its name, and of a file its size and time."""
@@ -140,14 +140,16 @@ class Recording:
             text = "#" + ":".join("" if end is None else str(end) for end in ends)
             raise SourceError(f"the slice {text} leaves none of the {len(self.frames)} frames of {self.name}")
         encodings = None if self.encodings is None else self.encodings[part]
-        whole = self.whole or self
-        return dataclasses.replace(self, frames=frames, encodings=encodings, n_before_slice=self.n_whole, whole=whole)
+        full_recording = self.full_recording or self
+        return dataclasses.replace(
+            self, frames=frames, encodings=encodings, n_before_slice=self.n_whole, full_recording=full_recording
+        )
 
 
 AnyRecording = TypeVar("AnyRecording", bound=Recording)
 
 
-def counted(names: Mapping[str, Sequence[str]]) -> dict[str, int]:
+def counts_of(names: Mapping[str, Sequence[str]]) -> dict[str, int]:
     """Reason -> how many frames are left out for it."""
     return {reason: len(frames) for reason, frames in names.items()}
 

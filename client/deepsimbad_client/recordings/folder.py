@@ -29,12 +29,12 @@ from deepsimbad_client.recordings import (
     stamp_of,
     with_grey_levels,
 )
+from deepsimbad_client.recordings.annotations import CAPTIONS
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, TRACK_SUFFIXES, read_exif, read_track, utm, zone_remarks
 from deepsimbad_client.recordings.names import in_order, times_of
 from deepsimbad_client.recordings.nclt import TURNED_UPRIGHT, drives_in, lies_on_its_side
 from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed, placed_on
 from deepsimbad_client.recordings.positions import POSITIONS_FILE, positions_file, read_positions
-from deepsimbad_client.recordings.told import CAPTIONS
 
 _ORIENTATION, _MODEL = 0x0112, 0x0110  # of EXIF
 _LYING = range(5, 9)  # orientations in which width is height

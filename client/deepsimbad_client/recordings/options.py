@@ -12,9 +12,9 @@ from rich.progress import Progress
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad_client.errors import InvalidArgumentError
 from deepsimbad_client.recordings import MOST_LEFT_OUT, LeftOut, Recording, left_out_lines, read_file
+from deepsimbad_client.recordings.annotations import ANNOTATION_SUFFIXES, as_taken
 from deepsimbad_client.recordings.folder import single
 from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES, one_turn, open_source
-from deepsimbad_client.recordings.told import TOLD_SUFFIXES, as_taken
 
 Command = Callable[..., Any]
 
@@ -62,7 +62,7 @@ _NAMES = ("spacing_m", "undistortion", "rotate", "time_offset_s", "every_s", "ev
 
 
 def reading(command: Command) -> Command:
-    """Options of every command that reads a recording; given on as `reading`, arguments of `opened`."""
+    """Options of every command that reads a recording; given on as `reading`, arguments of `open_recording`."""
 
     @wraps(command)
     def with_reading(**options: Any) -> Any:
@@ -82,7 +82,7 @@ def accounting(command: Command) -> Command:
     return missing(click.option("--verbose", is_flag=True, help="Name every frame that is left out.")(command))
 
 
-def opened(source: str, allow_missing: bool = True, *, closed: bool = False, **reading: Any) -> Recording:
+def open_recording(source: str, allow_missing: bool = True, *, closed: bool = False, **reading: Any) -> Recording:
     """Open a SOURCE, one turn of a closed route, telling on standard error what it was taken for.
 
     Raises SourceError, TooManyLeftOutError, click.UsageError (an option does not go with the recording).
@@ -126,8 +126,8 @@ def views(
     said: set[str] = set()  # of many files once
     for name in images:
         path = Path(name)
-        if path.is_file() and path.suffix.lower() in TOLD_SUFFIXES:
-            yield name, {"image": read_file(path), "content_type": TOLD_SUFFIXES[path.suffix.lower()]}
+        if path.is_file() and path.suffix.lower() in ANNOTATION_SUFFIXES:
+            yield name, {"image": read_file(path), "content_type": ANNOTATION_SUFFIXES[path.suffix.lower()]}
             continue
         is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
         if is_image:
@@ -136,7 +136,7 @@ def views(
                 tell_remarks(recording)
             said.update(recording.remarks)
         else:
-            recording = opened(name, rotate=rotate)
+            recording = open_recording(name, rotate=rotate)
             tell_left_out(recording.left_out_names, recording.name, verbose=False)
         recording = as_taken(recording, takes).shown_by(levels)
         for row, frame in enumerate(recording.frames):

@@ -24,7 +24,7 @@ from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.models import Domain, Localization, SessionAnswer
 from deepsimbad_client.http.upload import UNUSABLE_IMAGE_CODES
 from deepsimbad_client.recordings import Recording, columns_of
-from deepsimbad_client.recordings.told import as_taken
+from deepsimbad_client.recordings.annotations import as_taken
 
 Record = TypeVar("Record")
 

@@ -57,7 +57,7 @@ from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.options import (
     accounting,
     camera_of_option,
-    opened,
+    open_recording,
     reading,
     rotate_option,
     tell_left_out,
@@ -171,7 +171,9 @@ def map_(
     measure = make_evaluator(evaluator, settings.compute())
     # A mistake in what was typed should cost no minutes of encoding, and leave no domain behind.
     sources = {"training": training} if landmarks is None else {"landmarks": landmarks, "training": training}
-    recordings = {role: opened(source, allow_missing, closed=closed, **reading) for role, source in sources.items()}
+    recordings = {
+        role: open_recording(source, allow_missing, closed=closed, **reading) for role, source in sources.items()
+    }
     left_out = {}
     refuse_impossible(config, {role: len(recording.frames) for role, recording in recordings.items()}, None)
     with open_given_catalog() as catalog:

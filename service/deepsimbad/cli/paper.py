@@ -47,7 +47,7 @@ from deepsimbad.jobs.progress import Shares, in_threads
 from deepsimbad.release import release
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.options import opened, reading
+from deepsimbad_client.recordings.options import open_recording, reading
 from deepsimbad_client.recordings.sources import ENCODING_SUFFIXES, NCLT_PREFIX
 
 _ENCODE_S = 0.05  # a frame, on one core of a server's
@@ -172,7 +172,7 @@ def _opened(root: Path, least_m: float, reading: Mapping[str, Any]) -> tuple[dic
         ready = (root / f"{date}{suffix}" for suffix in sorted(ENCODING_SUFFIXES, reverse=True))
         source = next((str(file) for file in ready if file.is_file()), f"{NCLT_PREFIX}{root / date}")
         try:
-            drive = opened(source, **reading)
+            drive = open_recording(source, **reading)
         except SourceError as error:
             missing[season] = f"{date}: {' '.join(str(error).split())}"
             continue

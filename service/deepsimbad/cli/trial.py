@@ -38,7 +38,7 @@ from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.recordings import Recording
-from deepsimbad_client.recordings.options import accounting, opened, reading, tell_left_out
+from deepsimbad_client.recordings.options import accounting, open_recording, reading, tell_left_out
 
 _STRETCHES_TOLD = 5
 
@@ -84,7 +84,7 @@ def try_(
     settings = given_settings()
     measure = make_evaluator(evaluator, settings.compute())
     sources = {"database": database, "queries": queries} | ({} if landmarks is None else {"landmarks": landmarks})
-    recordings = {role: opened(source, allow_missing, **reading) for role, source in sources.items()}
+    recordings = {role: open_recording(source, allow_missing, **reading) for role, source in sources.items()}
     recordings["queries"] = recordings["queries"].shown_by(recordings["database"].grey_levels)  # as live views are
     names = {role: recording.name for role, recording in recordings.items()}
     tolerance_m = usual_tolerance_m(*recordings.values()) if tolerance is None else tolerance

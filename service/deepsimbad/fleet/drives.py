@@ -30,8 +30,8 @@ from deepsimbad.release import release
 from deepsimbad.store.objects import Objects
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import EncodedImage, Frame, Recording
+from deepsimbad_client.recordings.annotations import as_taken
 from deepsimbad_client.recordings.folder import FolderRecording
-from deepsimbad_client.recordings.told import as_taken
 
 _FRAMES_A_PACK = 256  # about 1 MB of encodings, and as much as a kill may cost every worker
 _URL = re.compile(r"((?:s3|gs|az)://[^#]+?)/*(#.*)?")
@@ -150,7 +150,9 @@ def _stamps(recording: Recording, pack: Sequence[range]) -> str:
 
 def _identity(recording: Recording, evaluator: Evaluator, configuration: dict[str, Any], max_pixels: int) -> str:
     """What encodings follow from, beside the frames' files."""
-    how = dataclasses.replace(recording, frames=(), left_out_names={}, remarks=(), whole=None, n_before_slice=None)
+    how = dataclasses.replace(
+        recording, frames=(), left_out_names={}, remarks=(), full_recording=None, n_before_slice=None
+    )
     batch = evaluator.largest_batch
     about = [release(), repr(how), configuration, evaluator.weights_sha256, evaluator.input_size, batch, max_pixels]
     return hashlib.sha256(json.dumps(about, default=str, sort_keys=True).encode()).hexdigest()[:16]

@@ -29,8 +29,8 @@ from deepsimbad.evaluators.space import seen
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
-from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, counted
-from deepsimbad_client.recordings.told import as_taken
+from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, counts_of
+from deepsimbad_client.recordings.annotations import as_taken
 
 Kept: TypeAlias = MutableMapping[str, tuple[NDArray[np.float32], bool]]
 """Encodings [d], and whether the image shows nothing, by `Recording.stamp`."""
@@ -51,7 +51,7 @@ class EncodedRecording:
     @property
     def left_out(self) -> dict[str, int]:
         """Reason -> how many frames could not be used."""
-        return counted(self.left_out_names)
+        return counts_of(self.left_out_names)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def encode_recording(
         )
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
-        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {counted(left_out.names)}")
+        raise InvalidSourceError(f"{recording.name} has no frame that can be used: {counts_of(left_out.names)}")
 
     drive = Drive(
         **columns_of(frames),

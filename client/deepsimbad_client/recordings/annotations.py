@@ -19,13 +19,13 @@ from deepsimbad_client.http import scene_observation
 from deepsimbad_client.recordings import EncodedImage, Frame, Recording
 
 DETECTIONS, CAPTIONS = "detections.jsonl", "captions.csv"
-TOLD_SUFFIXES = {".txt": "text/plain", ".json": "application/json"}
+ANNOTATION_SUFFIXES = {".txt": "text/plain", ".json": "application/json"}
 """Of files that tell of one view, and how they are posted."""
 FORMS = {"objects": DETECTIONS, "text": CAPTIONS}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ToldRecording(Recording):
+class AnnotatedRecording(Recording):
     """A recording whose frames are seen by what is told of them, beside their images or in their place."""
 
     pictured: Recording
@@ -37,7 +37,7 @@ class ToldRecording(Recording):
         said = json.dumps([by_name.get(frame.name) for by_name in self.told.values()])
         return f"{self.pictured.stamp(frame) if self.with_image else frame.name} {said}"
 
-    def shown_by(self, levels: GreyLevels | None) -> "ToldRecording":
+    def shown_by(self, levels: GreyLevels | None) -> "AnnotatedRecording":
         """See `Recording.shown_by`."""
         return dataclasses.replace(self, pictured=self.pictured.shown_by(levels))
 
@@ -57,7 +57,7 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
     Raises SourceError: what should be told of its images is not there, or cannot be understood.
     """
     forms = [form for form in FORMS if form in takes]
-    if recording.encodings is not None or not forms or isinstance(recording, ToldRecording):
+    if recording.encodings is not None or not forms or isinstance(recording, AnnotatedRecording):
         return recording
     folder, told = getattr(recording, "folder", None), dict[str, Mapping[str, Any]]()
     for form in forms:
@@ -71,7 +71,7 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
             f"{recording.name} has no {' nor '.join(FORMS[form] for form in forms)} beside its images, and the domain "
             f"takes {' and '.join(sorted(takes))}"
         )
-    return ToldRecording(
+    return AnnotatedRecording(
         **{field.name: getattr(recording, field.name) for field in dataclasses.fields(Recording)},
         pictured=recording,
         told=told,
