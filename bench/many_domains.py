@@ -33,7 +33,7 @@ from deepsimbad.jobs.build import encode_recording
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import maps_folder, traverses_folder
 from deepsimbad.store.map_file import seal, write_map
-from deepsimbad.store.records import now
+from deepsimbad.store.records import current_moment
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client import Client
 from deepsimbad_client.http.local_server import LocalServer
@@ -211,7 +211,7 @@ def write_domains(data_dir: Path, n: int) -> None:
     """Domains of 200 map images each, straight into catalog and folders: distinct files, later hard links."""
     encodings = np.random.default_rng(0).normal(size=(200, 64)).astype(np.float32)
     map_ = replace(mapped(encodings), evaluator={"kind": "feature_l2", "extractor": "none"})
-    at, digest, n_bytes = now(), "", 0
+    at, digest, n_bytes = current_moment(), "", 0
     domains, versions = [], []
     with Catalog.open(data_dir) as catalog:
         for number in range(n):

@@ -21,7 +21,7 @@ pytest.importorskip("obstore", reason="the extra `objects` is not installed")
 
 @contextmanager
 def node(data_dir, url, is_own=lambda _: False, **settings):
-    shared = Substitutes(sessions=partial(SharedSessionStore.sharing, Objects.open(url), is_own=is_own))
+    shared = Substitutes(sessions=partial(SharedSessionStore.open_shared, Objects.open(url), is_own=is_own))
     app = create_app(small_settings(data_dir, **settings), InThisProcess(data_dir), shared)
     with Client(app, raise_server_exceptions=False) as client:
         yield client
@@ -157,7 +157,7 @@ def test_who_lives_is_known_everywhere(nodes):
 
 
 def test_a_beginning_asks_who_began_since_and_at_the_limit_who_lives(nodes, monkeypatch):
-    monkeypatch.setattr(shared_sessions, "_KEPT_S", 1e9)
+    monkeypatch.setattr(shared_sessions, "_LISTING_AGE_S", 1e9)
     one, other = nodes("one", max_sessions=3), nodes("other", max_sessions=3)
     store, asked_after = one.services.session_store, []
     list_names = store._objects.names
@@ -175,7 +175,7 @@ def test_a_beginning_asks_who_began_since_and_at_the_limit_who_lives(nodes, monk
     other.delete(first)
     one.session()
     assert asked_after.count(None) == 2, "three lived when all were listed"
-    monkeypatch.setattr(shared_sessions, "_KEPT_S", -1)
+    monkeypatch.setattr(shared_sessions, "_LISTING_AGE_S", -1)
     assert len(store.holders(may_have_ended=True)) == 3
     assert asked_after[-1] is None
 

@@ -170,14 +170,14 @@ def the_map(data_dir: Path) -> Iterator[object]:
 
 def the_sessions(data_dir: Path) -> Iterator[object]:
     with SessionStore.open(data_dir) as store:
-        (alive,) = store.living()
+        (alive,) = store.living_sessions()
         yield (alive.session_id, alive.config, alive.n_events, alive.expires_at)
-        snapshot, rows = store.history(alive.number, until=3)
+        snapshot, rows = store.history(alive.number, last_sequence=3)
         assert snapshot is not None
         yield (snapshot.sequence, snapshot.arrays["mass"].tolist(), [row.sequence for row in rows])
-        _, (first, second) = store.history(alive.number, until=2)
+        _, (first, second) = store.history(alive.number, last_sequence=2)
         yield (first, second) == (first, PriorRow(2, 4620.0, 1.5, 2.0))
-        yield store.named(alive.number, "k1")
+        yield store.find_observation(alive.number, "k1")
 
 
 MAP_FILE = "domains/campus/maps/000001.sqlite"

@@ -29,7 +29,7 @@ from deepsimbad.errors import (
 from deepsimbad.store import durable
 from deepsimbad.store.catalog import ApiKey, Catalog
 from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.records import JobState, KeyScope, MapState, now
+from deepsimbad.store.records import JobState, KeyScope, MapState, current_moment
 from deepsimbad.store.traverses import Traverse
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
@@ -345,14 +345,14 @@ def test_a_key_is_kept_without_its_secret(catalog: Catalog) -> None:
 def test_a_revoked_key_stays_in_the_list(catalog: Catalog) -> None:
     record, _ = catalog.create_key(KeyScope.LOCALIZE, lifetime=timedelta(days=2))
     assert record.expires_at is not None
-    assert record.is_usable(now())
+    assert record.is_usable(current_moment())
     assert not record.is_usable(record.expires_at)
     for unknown in ("0123456789ab", "", "\ud800", "' OR 1=1 --"):
         with pytest.raises(UnknownKeyError):
             catalog.revoke_key(unknown)
     revoked = catalog.revoke_key(record.key_id)
     assert revoked.revoked_at is not None
-    assert not revoked.is_usable(now())
+    assert not revoked.is_usable(current_moment())
     assert catalog.revoke_key(record.key_id) == revoked
     assert catalog.keys() == [revoked]
 
@@ -465,6 +465,6 @@ def test_a_deletion_that_was_cut_short_is_finished(campus: Catalog) -> None:
     assert (stale.exists(), stale.parent.is_dir()) == (False, True)
     sealed(campus)
     with campus._writing() as db:  # of a map, before its file is unlinked
-        db.execute("UPDATE map SET state = 'retired', removed_at = ?", [now()])
+        db.execute("UPDATE map SET state = 'retired', removed_at = ?", [current_moment()])
     assert campus.discard_unfinished() == ["removed the file of the removed map 1 of domain campus"]
     assert not campus.map_path("campus", 1).exists()

@@ -45,7 +45,7 @@ def test_an_object_is_written_whole_and_read_as_it_was(objects: Objects, tmp_pat
         list(objects.stream("maps/none"))
     assert sorted(objects.names("domains/")) == ["domains/a"]
     objects.put("domains/b", b"")
-    assert sorted(objects.names("domains/", after="domains/a")) == ["domains/b"]
+    assert sorted(objects.names("domains/", "domains/a")) == ["domains/b"]
     assert list(objects.names("nothing/")) == []
     for _ in range(2):
         objects.delete("domains/b")

@@ -41,7 +41,7 @@ def test_a_session_is_found_again_as_it_was(store: SessionStore, tmp_path: Path)
     assert store.find("s1") == session
     store.append(session.number, observed(1), 101.0).result()
     store.append(session.number, PriorRow(2, 333.0, 1.0, 2.0), 102.0).result()
-    assert store.living() == [replace(session, expires_at=333.0, n_events=2)]
+    assert store.living_sessions() == [replace(session, expires_at=333.0, n_events=2)]
     store.close()
     with SessionStore.open(tmp_path) as again:
         assert again.find("s1") == replace(session, expires_at=333.0, n_events=2)
@@ -88,8 +88,8 @@ def test_a_sequence_number_or_key_is_taken_once(store: SessionStore) -> None:
         store.append(number, observed(1), 1.0).result()
     with pytest.raises(InvalidInputError):
         store.append(number, observed(2, idempotency=named), 1.0).result()
-    assert store.named(number, "k") == (1, b"d")
-    assert store.named(number, "other") is None
+    assert store.find_observation(number, "k") == (1, b"d")
+    assert store.find_observation(number, "other") is None
     other = store.create(replace(RECORD, session_id="s2")).result().number
     store.append(other, observed(1, idempotency=named), 1.0).result()  # keys are a session's own
     assert len(store.history(number, 9)[1]) == 1
@@ -121,7 +121,7 @@ def test_ended_sessions_are_remembered_until_they_are_purged(store: SessionStore
     assert store.end(numbers[0], "deleted", 1000.0).result() is True
     assert store.end(numbers[0], "expired", 1001.0).result() is False
     assert store.end(numbers[1], "expired", 2000.0).result() is True
-    assert [session.session_id for session in store.living()] == ["s2"]
+    assert [session.session_id for session in store.living_sessions()] == ["s2"]
     assert store.find("s0").ending == "deleted"
     while store.purge(1500.0).result():
         pass
@@ -226,7 +226,7 @@ def rows(folder: Path) -> list[int]:
 def test_what_waits_is_committed_together_and_in_order(store: SessionStore, batches: list[int], tmp_path: Path) -> None:
     hold = threading.Event()
     store._commits.submit(lambda db: hold.wait())
-    while not store._commits._waiting.empty():
+    while not store._commits._queue.empty():
         time.sleep(0.001)
     waiting = [store._commits.submit(insert(n)) for n in range(MAX_BATCH + 40)]
     assert waiting[7].cancel() is False, "who goes away does not undo what is on its way"
@@ -261,7 +261,7 @@ def test_a_write_may_be_on_the_disk_before_its_sender_goes_on(
 ) -> None:
     """The sender's thread may be put aside, for as long as a commit takes, right after it handed the write in."""
     number = store.create(RECORD).result().number
-    waiting = store._commits._waiting
+    waiting = store._commits._queue
 
     class Preempted:
         get, empty = waiting.get, waiting.empty
@@ -271,9 +271,9 @@ def test_a_write_may_be_on_the_disk_before_its_sender_goes_on(
             if write is not None:
                 wait([done for _, done in write], timeout=60)
 
-    monkeypatch.setattr(store._commits, "_waiting", Preempted())
+    monkeypatch.setattr(store._commits, "_queue", Preempted())
     store.append(number, observed(1), 101.0).result(60)
-    assert store.living()[0].n_events == 1
+    assert store.living_sessions()[0].n_events == 1
 
 
 def test_what_an_event_loop_appends_at_one_turn_is_written_together(tmp_path: Path) -> None:

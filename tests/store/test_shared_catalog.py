@@ -280,8 +280,8 @@ def test_a_new_node_begins_with_all_domains_in_one_object(
     state = json.loads(gzip.decompress((store[1] / "state.json.gz").read_bytes()))
     assert (state["position"], sorted(state["domains"])) == (4, ["campus", "domain-0"])
     asked = []
-    parsed = map_store._parsed
-    monkeypatch.setattr(map_store, "_parsed", lambda content, name: asked.append(name) or parsed(content, name))
+    parsed = map_store._parse
+    monkeypatch.setattr(map_store, "_parse", lambda content, name: asked.append(name) or parsed(content, name))
     there = node("there")
     assert there.domains() == here.domains()
     assert asked[1:] == ["state.json.gz", "log/000000000005.json"]

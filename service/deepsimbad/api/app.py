@@ -167,7 +167,7 @@ async def follow(services: Services) -> None:
 
     def catch_up(catalog: SharedCatalog) -> set[str]:
         """Take over all domains that changed; the names of those that were deleted."""
-        with catalog.following:  # who asks meanwhile waits until what has been read is served
+        with catalog.follow_lock:  # who asks meanwhile waits until what has been read is served
             return {domain for domain in catalog.follow() if not take_over(domain)}
 
     if isinstance(services.catalog, SharedCatalog):

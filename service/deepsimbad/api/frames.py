@@ -219,7 +219,7 @@ async def get_frames(domain: DomainName, name: TraverseName, running: Running) -
     def pack() -> bytes:
         with running.open_traverses.lend(domain, name) as traverse:
             content = BytesIO()
-            np.savez(content, **traverse.known())  # type: ignore[arg-type]
+            np.savez(content, **traverse.identities())  # type: ignore[arg-type]
             return content.getvalue()
 
     return Response(await run_sync(pack, limiter=running.batches), media_type=BINARY)

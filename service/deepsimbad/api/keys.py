@@ -14,7 +14,7 @@ from starlette.types import Scope
 
 from deepsimbad.errors import ForbiddenError, RateLimitedError, UnauthorizedError, UnavailableError
 from deepsimbad.store.catalog import ApiKey
-from deepsimbad.store.records import KeyRecord, KeyScope, now
+from deepsimbad.store.records import KeyRecord, KeyScope, current_moment
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class KeyRing:
         if key_id is None:
             return not self.by_id
         record = self.by_id.get(key_id)
-        return record is not None and record.is_usable(now())
+        return record is not None and record.is_usable(current_moment())
 
     def holder(self, presented: str) -> KeyRecord:
         """The key presented as text; raises UnauthorizedError where it is malformed, unknown, revoked or expired."""
@@ -101,7 +101,7 @@ class KeyRing:
         is_right = hmac.compare_digest(key.secret_sha256, _NO_DIGEST if record is None else record.secret_sha256)
         if record is None or not is_right:
             raise UnauthorizedError("the key is not known here")
-        if not record.is_usable(now()):  # told to its holder alone
+        if not record.is_usable(current_moment()):  # told to its holder alone
             reason = "expired" if record.revoked_at is None else "was revoked"
             raise UnauthorizedError(f"the key {reason}: ask the operator for another", key_id=record.key_id)
         return record

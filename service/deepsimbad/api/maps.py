@@ -31,7 +31,7 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.engine.maps import load_snapshot, unreadable
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
-from deepsimbad.store.catalog_maps import ANY, removed
+from deepsimbad.store.catalog_maps import ANY, removal_error
 from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"], route_class=StrictRoute)
@@ -144,7 +144,7 @@ async def get_map_file(domain: DomainName, version: MapVersion, request: Request
     def check() -> tuple[Path, str, int]:
         record = running.catalog.map(domain, version)
         if record.removed_at is not None:
-            raise removed(domain, version)
+            raise removal_error(domain, version)
         if record.sha256 is None:
             raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
         try:

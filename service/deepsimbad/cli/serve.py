@@ -27,7 +27,7 @@ from deepsimbad.errors import DeepSimbadError, UnavailableError, UnknownKeyError
 from deepsimbad.settings import unknown_variables, variable_of
 from deepsimbad.store.catalog import ApiKey, Catalog
 from deepsimbad.store.layout import catalog_path
-from deepsimbad.store.records import KeyRecord, KeyScope, now
+from deepsimbad.store.records import KeyRecord, KeyScope, current_moment
 
 log = logging.getLogger(__name__)
 
@@ -190,12 +190,12 @@ def revoke(key_id: str, as_json: bool) -> None:
         record = catalog.revoke_key(key_id if whole is None else whole.key_id)
         records = catalog.keys()
     report(as_json, _described(record), f"key {record.key_id} is revoked")
-    if not any(other.is_usable(now()) for other in records):
+    if not any(other.is_usable(current_moment()) for other in records):
         click.echo("no usable key is left: the service stays closed until one is created", err=True)
 
 
 def _described(record: KeyRecord) -> dict[str, Any]:
-    state = "usable" if record.is_usable(now()) else "expired"
+    state = "usable" if record.is_usable(current_moment()) else "expired"
     return {
         "key_id": record.key_id,
         "name": record.name,

@@ -24,10 +24,10 @@ from deepsimbad.errors import (
     UnknownMapVersionError,
 )
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import removed
+from deepsimbad.store.catalog_maps import removal_error
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.map_file import read_map
-from deepsimbad.store.records import DomainRecord, KeptMap, MapState, now
+from deepsimbad.store.records import DomainRecord, KeptMap, MapState, current_moment
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class Maps:
         self._checked_at: dict[str, float] = {}
         self._damaged: dict[str, tuple[int, DamagedMapError, float]] = {}  # version, why, and when that was noticed
         self._announced: dict[str, int] = {}
-        self._began_at = now()  # what was activated before is no news
+        self._began_at = current_moment()  # what was activated before is no news
         # By domain, version and digest: a domain that was deleted and made anew has other maps.
         self._held: WeakValueDictionary[tuple[str, int, str | None], Map] = WeakValueDictionary()
         self._loading = tuple(threading.RLock() for _ in range(_N_LOCKS))  # who asks for a map being read waits for it
@@ -320,7 +320,7 @@ class Maps:
         """
         record = self._catalog.settled_map(domain, version)
         if record.removed_at is not None:
-            raise removed(domain, version)
+            raise removal_error(domain, version)
         if record.sha256 is None:
             raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
         return self.pinned(domain, version, record.sha256).snapshot
@@ -408,7 +408,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
     """
     record = catalog.map(domain, version)
     if record.removed_at is not None:
-        raise removed(domain, version)
+        raise removal_error(domain, version)
     try:
         with storage_faults(catalog.map_path(domain, version), DamagedMapError):
             path = catalog.map_file(domain, version)
@@ -433,7 +433,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
 def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
     """The cause names a file of the server's; this names what a person can act on."""
     if catalog.map(domain, version).removed_at is not None:  # just now
-        return removed(domain, version)
+        return removal_error(domain, version)
     return DamagedMapError(
         f"map {version} of domain {domain} is damaged: activate another version or start a remap",
         domain=domain,

@@ -91,7 +91,7 @@ class Sessions:
         self._summaries = ThreadPoolExecutor(1, "summaries")
         self._under_way: set[asyncio.Task[Any]] = set()
         # Only who they are; what they believe is read at first touch, so a start takes no longer for many sessions.
-        self._living = {record.session_id: LiveSession(record, record.expires_at) for record in store.living()}
+        self._living = {record.session_id: LiveSession(record, record.expires_at) for record in store.living_sessions()}
 
     @property
     def n_living(self) -> int:
@@ -152,7 +152,10 @@ class Sessions:
         except SessionMovedError:
             live = await self._find(session_id, key_id)  # with what another node has written
             number, idempotency = live.record.number, observation.idempotency
-            if idempotency is None or await asyncio.to_thread(self._store.named, number, idempotency.key) is None:
+            if (
+                idempotency is None
+                or await asyncio.to_thread(self._store.find_observation, number, idempotency.key) is None
+            ):
                 raise
             return await self._finished(self._observe(live, observation, watch))  # which was this observation
 
@@ -259,7 +262,7 @@ class Sessions:
 
     async def _holders(self, *, may_have_ended: bool = False) -> list[str | None]:
         """The API key of every session that lives, wherever it does; see `SessionStore.holders`."""
-        if self._store.shares:
+        if self._store.is_shared:
             return await asyncio.to_thread(partial(self._store.holders, may_have_ended=may_have_ended))
         return [live.record.key_id for live in self._living.values()]
 
@@ -298,7 +301,7 @@ class Sessions:
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
         if key_id is not None:
             check_owner(live.record, key_id)
-        if self._store.shares:
+        if self._store.is_shared:
             async with live.lock:
                 self._heed(live, await asyncio.to_thread(self._store.find, session_id))
         if self._clock() >= live.expires_at and not live.lock.locked():
@@ -381,7 +384,7 @@ class Sessions:
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         idempotency, snapshot = observation.idempotency, state.engine.snapshot
         if idempotency is not None:
-            earlier = self._store.named(live.record.number, idempotency.key)
+            earlier = self._store.find_observation(live.record.number, idempotency.key)
             if earlier is not None and earlier[1] != idempotency.digest:
                 raise IdempotencyKeyReusedError(
                     "this idempotency key came before with another observation: choose a new one"

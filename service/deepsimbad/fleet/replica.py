@@ -84,7 +84,7 @@ class AllSessions(SharedSessionStore):
 
     replicas: Sequence[DeploymentHandle[Any]] = ()
 
-    def living(self) -> list[SessionRecord]:
+    def living_sessions(self) -> list[SessionRecord]:
         """None, though copies of some be here."""
         return []
 
@@ -178,7 +178,10 @@ class Replica:
         if number is not None:
             settings = settings.model_copy(update={"data_dir": administrator_folder(settings.data_dir, number)})
             elsewhere = replace(
-                elsewhere, sessions=partial(AllSessions.sharing, objects), administrator=number, newest_jobs=jobs.newest
+                elsewhere,
+                sessions=partial(AllSessions.open_shared, objects),
+                administrator=number,
+                newest_jobs=jobs.newest,
             )
         else:
             folder = _new_folder()
@@ -188,7 +191,7 @@ class Replica:
             others = [Backend(serve.get_deployment_handle(replica_name(other))) for other in range(n_replicas)]
             self._watching += [asyncio.create_task(backend.watch()) for backend in others]
             sessions = partial(
-                SharedSessionStore.sharing,
+                SharedSessionStore.open_shared,
                 objects,
                 is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
             )
@@ -259,9 +262,9 @@ class Replica:
         return await asyncio.to_thread(self._services.catalog.numbered_jobs, None, before, limit)
 
     async def listed(self, session_ids: Sequence[str]) -> list[ListedSession]:
-        """As `SharedSessionStore.listed`."""
+        """As `SharedSessionStore.listed_sessions`."""
         store = cast("SharedSessionStore", self._services.session_store)
-        return await asyncio.to_thread(store.listed, session_ids)
+        return await asyncio.to_thread(store.listed_sessions, session_ids)
 
     async def answer(self, method: str, *arguments: Any) -> Any:
         """What `gathered` or `part` answers, or the error of ours that it raises."""

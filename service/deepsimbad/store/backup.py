@@ -24,12 +24,12 @@ from deepsimbad.store.connection import check_integrity, in_todays_schema, look_
 from deepsimbad.store.durable import PRIVATE, service_lock, sha256_of, storage_faults, sync, verify, written_aside
 from deepsimbad.store.layout import NAME_PATTERN
 from deepsimbad.store.map_file import read_map
-from deepsimbad.store.records import now
-from deepsimbad_migrations.catalog.migrations import migrations as of_catalog
-from deepsimbad_migrations.map.migrations import migrations as of_map
-from deepsimbad_migrations.session.migrations import migrations as of_sessions
-from deepsimbad_migrations.thumbnail.migrations import migrations as of_thumbnails
-from deepsimbad_migrations.traverse.migrations import migrations as of_traverse
+from deepsimbad.store.records import current_moment
+from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
+from deepsimbad_migrations.map.migrations import migrations as map_migrations
+from deepsimbad_migrations.session.migrations import migrations as session_migrations
+from deepsimbad_migrations.thumbnail.migrations import migrations as thumbnail_migrations
+from deepsimbad_migrations.traverse.migrations import migrations as traverse_migrations
 
 Progress = Callable[[float], None]
 """Called with 0..1; what it raises (a cancel) ends the work and leaves nothing of it."""
@@ -37,19 +37,19 @@ Progress = Callable[[float], None]
 _FORMAT = {"format": "deepsimbad-backup", "format_version": 1}
 _MANIFEST = "manifest.json"
 _CATALOG, _SESSIONS = "catalog.sqlite", "sessions.sqlite"
-_OF_OLDER_RELEASES = "archive.sha256"  # a digest of all before it, which the members' own make needless
+_OLD_DIGEST_MEMBER = "archive.sha256"  # a digest of all before it, which the members' own make needless
 _MEMBERS: dict[str, Migrations] = {
-    r"catalog\.sqlite": of_catalog,
-    r"sessions\.sqlite": of_sessions,
-    rf"domains/{NAME_PATTERN}/traverses/{NAME_PATTERN}\.sqlite": of_traverse,
-    rf"domains/{NAME_PATTERN}/maps/\d{{6,16}}\.sqlite": of_map,
-    rf"domains/{NAME_PATTERN}/thumbnails\.sqlite": of_thumbnails,
+    r"catalog\.sqlite": catalog_migrations,
+    r"sessions\.sqlite": session_migrations,
+    rf"domains/{NAME_PATTERN}/traverses/{NAME_PATTERN}\.sqlite": traverse_migrations,
+    rf"domains/{NAME_PATTERN}/maps/\d{{6,16}}\.sqlite": map_migrations,
+    rf"domains/{NAME_PATTERN}/thumbnails\.sqlite": thumbnail_migrations,
 }
-_MOST_TRIES = 10
-_MOST_LINES = 20
+_MAX_TRIES = 10
+_MAX_LINES = 20
 _STAGING = ".restoring"
 
-Listed = frozenset[tuple[str, int, str]]
+Inventory = frozenset[tuple[str, int, str]]
 """What a catalog says there is: (domain, version, SHA-256) of sealed maps; (domain, 0, created_at) of domains."""
 
 
@@ -98,12 +98,12 @@ def migrations_of(name: str) -> Migrations | None:
     return next((migrations for pattern, migrations in _MEMBERS.items() if re.fullmatch(pattern, name)), None)
 
 
-def _listed_in(path: Path, data_dir: Path) -> Listed:
+def _inventory(path: Path, data_dir: Path) -> Inventory:
     """Read a catalog; of maps that a store keeps, those that have their files here. Raises DamagedFileError."""
 
-    def read(db: Database) -> Listed:
-        with in_todays_schema(db, of_catalog, path) as current:
-            rows = current.execute(
+    def read(db: Database) -> Inventory:
+        with in_todays_schema(db, catalog_migrations, path) as current_db:
+            rows = current_db.execute(
                 "SELECT domain, version, sha256, shared FROM map WHERE state != 'building' AND removed_at IS NULL"
             ).fetchall()
             maps = [
@@ -111,7 +111,7 @@ def _listed_in(path: Path, data_dir: Path) -> Listed:
                 for domain, version, digest, is_shared in rows
                 if not is_shared or layout.map_path(data_dir, domain, version).exists()
             ]
-            return frozenset([*maps, *current.execute("SELECT name, 0, created_at FROM domain").fetchall()])
+            return frozenset([*maps, *current_db.execute("SELECT name, 0, created_at FROM domain").fetchall()])
 
     with storage_faults(path):
         return look_at(path, read)
@@ -126,41 +126,41 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
     is whole; it replaces none (ConflictError).
     """
     catalog = layout.catalog_path(data_dir)
-    with storage_faults(file), written_aside(file, "a backup") as new:
-        for _ in range(_MOST_TRIES):
-            created_at, problem = now(), None
+    with storage_faults(file), written_aside(file, "a backup") as new_path:
+        for _ in range(_MAX_TRIES):
+            created_at, problem = current_moment(), None
             members: list[dict[str, Any]] = []
-            with tarfile.open(new, "w:", format=tarfile.PAX_FORMAT) as tar:
-                new.chmod(0o600)  # it holds the hashes of keys and where robots were
+            with tarfile.open(new_path, "w:", format=tarfile.PAX_FORMAT) as tar:
+                new_path.chmod(0o600)  # it holds the hashes of keys and where robots were
                 if layout.sessions_path(data_dir).exists():
-                    members.append(_add_copy(tar, data_dir, layout.sessions_path(data_dir), new.parent))
-                members.append(_add_copy(tar, data_dir, catalog, new.parent))
-                listed = _listed_in(new.parent / _CATALOG, data_dir)
+                    members.append(_add_copy(tar, data_dir, layout.sessions_path(data_dir), new_path.parent))
+                members.append(_add_copy(tar, data_dir, catalog, new_path.parent))
+                inventory = _inventory(new_path.parent / _CATALOG, data_dir)
                 try:
-                    for n_done, (domain, version, digest) in enumerate(sorted(listed)):
-                        on_progress(n_done / len(listed))
+                    for n_done, (domain, version, digest) in enumerate(sorted(inventory)):
+                        on_progress(n_done / len(inventory))
                         if version > 0:
                             members.append(_add_map(tar, data_dir, domain, version, digest))
                         else:
-                            members += _add_files(tar, data_dir, domain, new.parent)
+                            members += _add_files(tar, data_dir, domain, new_path.parent)
                 except UnavailableError as error:
                     problem = error
-                about = {**_FORMAT, "release": release, "created_at": created_at, "files": members}
-                manifest = json.dumps(about, indent=1).encode()
+                manifest = {**_FORMAT, "release": release, "created_at": created_at, "files": members}
+                content = json.dumps(manifest, indent=1).encode()
                 info = tarfile.TarInfo(_MANIFEST)
-                info.size, info.mode, info.mtime = len(manifest), 0o600, int(time.time())
-                tar.addfile(info, io.BytesIO(manifest))
-            if listed <= _listed_in(catalog, data_dir):  # else a damaged or missing file may be one that went meanwhile
+                info.size, info.mode, info.mtime = len(content), 0o600, int(time.time())
+                tar.addfile(info, io.BytesIO(content))
+            if inventory <= _inventory(catalog, data_dir):  # else a damaged or missing file may have gone meanwhile
                 break
         else:
             raise UnavailableError("maps come and go faster than they can be copied: try again", reason="busy")
         if problem is not None:
             raise problem
         on_progress(1.0)
-        digest, n_bytes = sha256_of(new), new.stat().st_size
-    n_maps = sum(version > 0 for _, version, _ in listed)
+        digest, n_bytes = sha256_of(new_path), new_path.stat().st_size
+    n_maps = sum(version > 0 for _, version, _ in inventory)
     n_traverses = sum("/traverses/" in member["name"] for member in members)
-    return BackupReport(str(file), n_bytes, digest, created_at, len(listed) - n_maps, n_maps, n_traverses)
+    return BackupReport(str(file), n_bytes, digest, created_at, len(inventory) - n_maps, n_maps, n_traverses)
 
 
 def _add_copy(tar: tarfile.TarFile, data_dir: Path, path: Path, folder: Path) -> dict[str, Any]:
@@ -226,14 +226,14 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
     try:
         tar = tarfile.open(file, "r:")  # noqa: SIM115 - closed below
     except (OSError, tarfile.TarError) as error:
-        raise _wrong(file, f"it cannot be read, or is no backup: {error}") from error
+        raise _invalid_archive(file, f"it cannot be read, or is no backup: {error}") from error
     with tar, storage_faults(data_dir):
-        about, members = _manifest(tar, file)
+        manifest, members = _manifest(tar, file)
         with _staging(data_dir) as staging:
             for n_done, member in enumerate(members):
                 on_progress(n_done / len(members))
                 _unpack(tar, file, member, staging)
-            for domain, _, _ in _listed_in(staging / _CATALOG, staging):  # of those without files too
+            for domain, _, _ in _inventory(staging / _CATALOG, staging):  # of those without files too
                 layout.traverses_folder(staging, domain).mkdir(parents=True, exist_ok=True)
                 layout.maps_folder(staging, domain).mkdir(parents=True, exist_ok=True)
             for folder, _, _ in os.walk(staging, topdown=False):
@@ -241,32 +241,34 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
             _publish(staging, data_dir)
     on_progress(1.0)
     n_bytes = sum(member["bytes"] for member in members)
-    return RestoreReport(str(data_dir), len(members), n_bytes, str(about.get("created_at")), str(about.get("release")))
+    return RestoreReport(
+        str(data_dir), len(members), n_bytes, str(manifest.get("created_at")), str(manifest.get("release"))
+    )
 
 
 def _manifest(tar: tarfile.TarFile, file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """What a backup says of itself and of its members, which are those that it holds."""
     try:
-        infos = [info for info in tar.getmembers() if info.name not in {_MANIFEST, _OF_OLDER_RELEASES}]
+        infos = [info for info in tar.getmembers() if info.name not in {_MANIFEST, _OLD_DIGEST_MEMBER}]
         stream = tar.extractfile(_MANIFEST)
-        about = json.load(stream) if stream else {}
+        manifest = json.load(stream) if stream else {}
         members = [
             {"name": member["name"], "bytes": int(member["bytes"]), "sha256": member["sha256"]}
-            for member in about["files"]
+            for member in manifest["files"]
         ]
     except (tarfile.TarError, OSError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise _wrong(file, f"it is no backup, or was cut short or changed: {error}") from error
-    if about.get("format") != _FORMAT["format"] or _CATALOG not in {member["name"] for member in members}:
-        raise _wrong(file, "it is no backup of a data directory")
-    if about.get("format_version") != _FORMAT["format_version"]:
-        raise _wrong(file, "it was written by a newer release: upgrade this one")
+        raise _invalid_archive(file, f"it is no backup, or was cut short or changed: {error}") from error
+    if manifest.get("format") != _FORMAT["format"] or _CATALOG not in {member["name"] for member in members}:
+        raise _invalid_archive(file, "it is no backup of a data directory")
+    if manifest.get("format_version") != _FORMAT["format_version"]:
+        raise _invalid_archive(file, "it was written by a newer release: upgrade this one")
     for info in infos:  # no links, devices, folders or files of other names
         if info.type != tarfile.REGTYPE or info.sparse is not None or migrations_of(info.name) is None:
-            raise _wrong(file, f"{info.name!a} has no place in it")
+            raise _invalid_archive(file, f"{info.name!a} has no place in it")
     sizes = sorted((info.name, info.size) for info in infos)
     if sizes != sorted((member["name"], member["bytes"]) for member in members):
-        raise _wrong(file, "its manifest does not list what is in it")
-    return about, members
+        raise _invalid_archive(file, "its manifest does not list what is in it")
+    return manifest, members
 
 
 @contextmanager
@@ -276,12 +278,12 @@ def _staging(data_dir: Path) -> Iterator[Path]:
     try:
         with service_lock(data_dir, "restoring a backup"):
             staging = data_dir / _STAGING
-            present = {path.name: path for path in data_dir.iterdir() if path != layout.service_lock_path(data_dir)}
-            if _STAGING in present and _CATALOG not in present:  # a restore that was cut short
-                for name in {_STAGING, _SESSIONS, layout.domains_folder(data_dir).name} & set(present):
-                    path = present.pop(name)
+            paths = {path.name: path for path in data_dir.iterdir() if path != layout.service_lock_path(data_dir)}
+            if _STAGING in paths and _CATALOG not in paths:  # a restore that was cut short
+                for name in {_STAGING, _SESSIONS, layout.domains_folder(data_dir).name} & set(paths):
+                    path = paths.pop(name)
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
-            if present:
+            if paths:
                 raise ConflictError(
                     f"{data_dir} is not empty: restore into a new folder, and move it into place afterwards"
                 )
@@ -304,13 +306,13 @@ def _unpack(tar: tarfile.TarFile, file: Path, member: dict[str, Any], staging: P
     stream, migrations = tar.extractfile(name), migrations_of(name)
     assert stream is not None
     assert migrations is not None
-    with target.open("xb") as into:
+    with target.open("xb") as output:
         try:
-            shutil.copyfileobj(stream, into)
+            shutil.copyfileobj(stream, output)
         except tarfile.TarError as error:
-            raise _wrong(file, "it was cut short") from error
+            raise _invalid_archive(file, "it was cut short") from error
     if sha256_of(target) != member["sha256"]:
-        raise _wrong(file, f"{name} does not match its SHA-256")
+        raise _invalid_archive(file, f"{name} does not match its SHA-256")
     with storage_faults(target):
         look_at(target, lambda db: pending_migrations(db, migrations, target))
     target.chmod(0o444 if target.parent.name == "maps" else 0o644)
@@ -329,8 +331,8 @@ def _publish(staging: Path, data_dir: Path) -> None:
     sync(data_dir.parent)
 
 
-def _wrong(file: Path, why: str) -> InvalidArchiveError:
-    return InvalidArchiveError(f"{file} cannot be restored: {why}", file=str(file))
+def _invalid_archive(file: Path, reason: str) -> InvalidArchiveError:
+    return InvalidArchiveError(f"{file} cannot be restored: {reason}", file=str(file))
 
 
 def inspect(data_dir: Path, on_progress: Progress) -> Inspection:
@@ -344,12 +346,12 @@ def inspect(data_dir: Path, on_progress: Progress) -> Inspection:
     for n_read, (path, digest) in enumerate(files.items(), start=1):
         problems[path] = _problems(data_dir, path, digest)
         on_progress(n_read / len(files))
-    again = _files(data_dir) if any(problems.values()) else {}
+    new_files = _files(data_dir) if any(problems.values()) else {}
     damaged = [
         Finding(path.relative_to(data_dir).as_posix(), line)
-        for path in again
+        for path in new_files
         if problems.get(path)
-        for line in _problems(data_dir, path, again[path])
+        for line in _problems(data_dir, path, new_files[path])
         if line in problems[path]
     ]
     return Inspection(len(files), tuple(damaged))
@@ -361,10 +363,10 @@ def _files(data_dir: Path) -> dict[Path, str | None]:
     files: dict[Path, str | None] = {catalog: None}
     if sessions.exists():
         files[sessions] = None
-    for working in ("traverses/*.sqlite", "thumbnails.sqlite"):
-        files |= dict.fromkeys(sorted(data_dir.glob(f"domains/*/{working}")), None)
+    for pattern in ("traverses/*.sqlite", "thumbnails.sqlite"):
+        files |= dict.fromkeys(sorted(data_dir.glob(f"domains/*/{pattern}")), None)
     with suppress(DeepSimbadError):
-        for domain, version, digest in sorted(_listed_in(catalog, data_dir)):
+        for domain, version, digest in sorted(_inventory(catalog, data_dir)):
             if version > 0:
                 files[layout.map_path(data_dir, domain, version)] = digest
     return files
@@ -374,8 +376,8 @@ def _problems(data_dir: Path, path: Path, digest: str | None) -> list[str]:
     """What is wrong with a file: its digest and content where it is a sealed map, else pages, references and schema."""
 
     def look(db: Database) -> list[str]:
-        lines = [line for (line,) in db.execute(f"PRAGMA integrity_check({_MOST_LINES})") if line != "ok"]
-        for table, row, parent, _ in db.execute("PRAGMA foreign_key_check").fetchmany(_MOST_LINES):
+        lines = [line for (line,) in db.execute(f"PRAGMA integrity_check({_MAX_LINES})") if line != "ok"]
+        for table, row, parent, _ in db.execute("PRAGMA foreign_key_check").fetchmany(_MAX_LINES):
             lines.append(f"row {row} of {table} refers to a row of {parent} that is not there")
         migrations = migrations_of(path.relative_to(data_dir).as_posix())
         if migrations is None:

@@ -31,10 +31,10 @@ from deepsimbad.store.records import (
     KeyRecord,
     KeyScope,
     ListPage,
-    after,
+    current_moment,
     from_json,
     get_domain,
-    now,
+    moment_after,
     read_domains,
     to_json,
 )
@@ -60,7 +60,7 @@ class ApiKey:
 
     @classmethod
     def parse(cls, text: str) -> Self | None:
-        """The key that a text is; None where it has not the form of one."""
+        """Read a key's text; None where it has not the form of one."""
         match = _KEY.fullmatch(text)
         return None if match is None else cls(*match.groups())
 
@@ -118,11 +118,11 @@ class Catalog(MapCatalog, JobCatalog):
         """
         folder = layout.domain_folder(self.data_dir, name)
         moves_m = [float(action) + 0.0 for action in actions_m]  # a zero has no sign
-        wanted = to_json({"evaluator": evaluator, "closed": closed, "actions_m": moves_m})
+        configuration = to_json({"evaluator": evaluator, "closed": closed, "actions_m": moves_m})
         row = {"evaluator": to_json(evaluator), "closed": int(closed), "actions_m": to_json(moves_m)}
         with self._writing() as db:
             for record in read_domains(db, name):
-                if to_json(record.configuration) != wanted:
+                if to_json(record.configuration) != configuration:
                     raise DomainDiffersError(
                         f"domain {name} exists with another configuration: delete it first, or choose another name",
                         present=record.configuration,
@@ -139,11 +139,11 @@ class Catalog(MapCatalog, JobCatalog):
                 raise ConflictError(
                     f"files of an unknown domain lie in {folder.parent.name}/{name}: move them away first"
                 )
-            db.table("domain").insert({"name": name, **row, "created_at": now()})
+            db.table("domain").insert({"name": name, **row, "created_at": current_moment()})
             layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
             layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
-            for changed in (folder, folder.parent, self.data_dir):
-                sync(changed)
+            for directory in (folder, folder.parent, self.data_dir):
+                sync(directory)
             record = get_domain(db, name)
         empty_graves(folder.parent)
         return record, True
@@ -151,8 +151,8 @@ class Catalog(MapCatalog, JobCatalog):
     def set_options(self, name: str, options: Mapping[str, Any]) -> DomainRecord:
         """Change what of a domain is shown and how; what is not named stays. Raises UnknownDomainError."""
         with self._writing() as db:
-            before = get_domain(db, name)
-            db.execute("UPDATE domain SET options = ? WHERE name = ?", [to_json({**before.options, **options}), name])
+            record = get_domain(db, name)
+            db.execute("UPDATE domain SET options = ? WHERE name = ?", [to_json({**record.options, **options}), name])
             return get_domain(db, name)
 
     def domain(self, name: str) -> DomainRecord:
@@ -165,20 +165,20 @@ class Catalog(MapCatalog, JobCatalog):
         with self._reading() as db:
             return read_domains(db)
 
-    def domain_page(self, after: str | None, limit: int) -> ListPage[DomainRecord, str]:
-        """A page of domains by name, behind the name `after`."""
+    def domain_page(self, last_key: str | None, limit: int) -> ListPage[DomainRecord, str]:
+        """A page of domains by name, behind the name `last_key`."""
         with self._reading() as db:
-            records = read_domains(db, after=after or "", limit=limit + 1)
+            records = read_domains(db, last_name=last_key or "", limit=limit + 1)
             return ListPage.of(((record.name, record) for record in records), limit)
 
     @property
     def n_domains(self) -> int:
-        """How many there are."""
+        """How many domains there are."""
         with self._reading() as db:
             return int(db.table("domain").count)
 
     def domain_names(self) -> set[str]:
-        """Of every domain: of a hundred thousand in some 50 ms, where `domains` takes seconds."""
+        """The names of every domain: a hundred thousand take some 50 ms, where `domains` takes seconds."""
         with self._reading() as db:
             return {name for (name,) in db.execute("SELECT name FROM domain")}
 
@@ -266,12 +266,16 @@ class Catalog(MapCatalog, JobCatalog):
             raise InvalidInputError("a key lives for more than no time at all")
         if domains is not None and scope is KeyScope.ADMIN:
             raise InvalidInputError("a key of scope admin opens every domain")
-        listed = None if domains is None else json.dumps([layout.checked_name(domain, "domain") for domain in domains])
-        expires_at = None if lifetime is None else after(lifetime)
+        domains_json = (
+            None if domains is None else json.dumps([layout.checked_name(domain, "domain") for domain in domains])
+        )
+        expires_at = None if lifetime is None else moment_after(lifetime)
         key = ApiKey.new()
         row = {"key_id": key.key_id, "name": name, "scope": scope, "secret_sha256": key.secret_sha256}
         with self._writing() as db:
-            db.table("api_key").insert({**row, "domains": listed, "created_at": now(), "expires_at": expires_at})
+            db.table("api_key").insert(
+                {**row, "domains": domains_json, "created_at": current_moment(), "expires_at": expires_at}
+            )
             return _get_key(db, key.key_id), key
 
     def keys(self) -> list[KeyRecord]:
@@ -283,7 +287,7 @@ class Catalog(MapCatalog, JobCatalog):
         """Let a key open nothing any more; one that was revoked stays so since then. Raises UnknownKeyError."""
         with self._writing() as db:
             if _get_key(db, key_id).revoked_at is None:
-                db.table("api_key").update(key_id, {"revoked_at": now()})
+                db.table("api_key").update(key_id, {"revoked_at": current_moment()})
             return _get_key(db, key_id)
 
 
@@ -298,5 +302,5 @@ def _get_key(db: Database, key_id: str) -> KeyRecord:
 
 def _key(row: tuple[Any, ...]) -> KeyRecord:
     key_id, name, scope, secret_sha256, domains, *times = row
-    opened = None if domains is None else tuple(json.loads(domains))
-    return KeyRecord(key_id, name, KeyScope(scope), secret_sha256, opened, *times)
+    key_domains = None if domains is None else tuple(json.loads(domains))
+    return KeyRecord(key_id, name, KeyScope(scope), secret_sha256, key_domains, *times)

@@ -10,7 +10,7 @@ from sqlite_utils import Database
 
 from deepsimbad.errors import JobInterruptedError, UnknownJobError
 from deepsimbad.store.connection import OpenFile
-from deepsimbad.store.records import JobRecord, JobState, ListPage, from_json, get_domain, now, to_json
+from deepsimbad.store.records import JobRecord, JobState, ListPage, current_moment, from_json, get_domain, to_json
 
 MAX_STARTS = 3  # of a job whose service died each time: it may be what kills it
 _SELECT = """
@@ -33,7 +33,7 @@ class JobCatalog(OpenFile):
             get_domain(db, domain)
             db.execute(
                 "INSERT INTO job (rowid, job_id, domain, kind, config, state, created_at) VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [_next_number(db, job_id), job_id, domain, kind, to_json(config), JobState.QUEUED, now()],
+                [_next_number(db, job_id), job_id, domain, kind, to_json(config), JobState.QUEUED, current_moment()],
             )
             return _get_job(db, job_id)
 
@@ -58,12 +58,12 @@ class JobCatalog(OpenFile):
         """Cancel a job that has not begun; any other stays as it is. Raises UnknownJobError."""
         with self._writing() as db:
             if _get_job(db, job_id).state is JobState.QUEUED:
-                ended = {"state": JobState.CANCELLED, "eta_s": None, "finished_at": now()}
-                db.table("job").update(job_id, ended)  # it never started
+                fields = {"state": JobState.CANCELLED, "eta_s": None, "finished_at": current_moment()}
+                db.table("job").update(job_id, fields)  # it never started
             return _get_job(db, job_id)
 
     def give_back_job(self, job_id: str) -> JobRecord:
-        """Let a running job wait for the next service, as this one stops; that start counts for nothing."""
+        """Let a running job wait for the next service, as this one stops; its start is not counted."""
         with self._writing() as db:
             job = _get_job(db, job_id)
             if job.state is JobState.RUNNING:
@@ -83,10 +83,10 @@ class JobCatalog(OpenFile):
                     db.table("job").update(job.job_id, _WAITING_AGAIN)
                     lines.append(f"job {job.job_id} was interrupted and waits again")
                 else:
-                    why = f"it was started {job.n_starts} times and the service died each time"
-                    error = {"code": JobInterruptedError.code, "message": why, "n_starts": job.n_starts}
+                    reason = f"it was started {job.n_starts} times and the service died each time"
+                    error = {"code": JobInterruptedError.code, "message": reason, "n_starts": job.n_starts}
                     _update(db, job.job_id, {"state": JobState.FAILED, "error": error, "eta_s": None})
-                    lines.append(f"job {job.job_id} failed: {why}")
+                    lines.append(f"job {job.job_id} failed: {reason}")
         return lines
 
     def waiting_jobs(self) -> list[str]:
@@ -99,12 +99,12 @@ class JobCatalog(OpenFile):
         with self._reading() as db:
             return _get_job(db, job_id)
 
-    def newest_jobs(self, domain: str | None, before: int | None, limit: int) -> ListPage[JobRecord, int]:
-        """A page of jobs, newest first, behind the key `before`; raises UnknownDomainError."""
-        return ListPage.of(self.numbered_jobs(domain, before, limit + 1), limit)
+    def newest_jobs(self, domain: str | None, last_key: int | None, limit: int) -> ListPage[JobRecord, int]:
+        """A page of jobs, newest first, behind `last_key`; raises UnknownDomainError."""
+        return ListPage.of(self.numbered_jobs(domain, last_key, limit + 1), limit)
 
-    def numbered_jobs(self, domain: str | None, before: int | None, limit: int) -> list[tuple[int, JobRecord]]:
-        """So many jobs, newest first, behind the key `before`, each with its own; raises UnknownDomainError.
+    def numbered_jobs(self, domain: str | None, last_key: int | None, limit: int) -> list[tuple[int, JobRecord]]:
+        """(key, job) of at most `limit` jobs, newest first, behind `last_key`; raises UnknownDomainError.
 
         Keys tell when a job was made, so that the jobs of several catalogs are one list.
         """
@@ -113,7 +113,7 @@ class JobCatalog(OpenFile):
                 get_domain(db, domain)
             rows = db.execute(
                 f"{_SELECT} WHERE domain = coalesce(?, domain) AND rowid < ? ORDER BY rowid DESC LIMIT ?",
-                [domain, _MAX_ROWID if before is None else before, limit],
+                [domain, _MAX_ROWID if last_key is None else last_key, limit],
             )
             return [(row[-1], _job(row)) for row in rows]
 
@@ -123,9 +123,9 @@ class JobCatalog(OpenFile):
 
 
 def _next_number(db: Database, job_id: str) -> int:
-    """Behind all that there are, whatever the clock was set to; the time to ten microseconds, and digits of the id."""
-    (last,) = db.execute("SELECT coalesce(max(rowid), 0) FROM job").fetchone()
-    return max(int(last) + 1, 1000 * int(1e5 * time.time()) + int(job_id[-4:], 16) % 1000)
+    """A row number past all others, whatever the clock: the time to ten microseconds, then three digits of the id."""
+    (last_number,) = db.execute("SELECT coalesce(max(rowid), 0) FROM job").fetchone()
+    return max(int(last_number) + 1, 1000 * int(1e5 * time.time()) + int(job_id[-4:], 16) % 1000)
 
 
 def _get_job(db: Database, job_id: str) -> JobRecord:
@@ -143,12 +143,12 @@ def _update(db: Database, job_id: str, fields: dict[str, Any]) -> JobRecord:
         return job
     values = {name: to_json(value) if isinstance(value, dict) else value for name, value in fields.items()}
     if not math.isfinite(fields.get("eta_s") or 0.0):
-        values["eta_s"] = None  # not known is what an infinite guess means
+        values["eta_s"] = None  # an infinite guess means that it is not known
     state = JobState(values.get("state", job.state))
     if state is not JobState.QUEUED and job.started_at is None:
-        values["started_at"] = now()
+        values["started_at"] = current_moment()
     if state.is_final:
-        values["finished_at"] = now()
+        values["finished_at"] = current_moment()
     db.table("job").update(job_id, values)
     return _get_job(db, job_id)
 

@@ -20,7 +20,16 @@ from deepsimbad.errors import (
 from deepsimbad.store import layout
 from deepsimbad.store.connection import OpenFile, open_database
 from deepsimbad.store.durable import lock_folder, remove_database, sync, verify
-from deepsimbad.store.records import KeptMap, ListPage, MapRecord, MapState, from_json, get_domain, now, to_json
+from deepsimbad.store.records import (
+    KeptMap,
+    ListPage,
+    MapRecord,
+    MapState,
+    current_moment,
+    from_json,
+    get_domain,
+    to_json,
+)
 
 _SELECT_MAP = """
     SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at,
@@ -31,7 +40,7 @@ _MAX_INTEGER = 2**63 - 1
 
 
 class AnyVersion(Enum):
-    """To activate a map whatever is active now."""
+    """What `activate` expects where any version, or none, may be active."""
 
     ANY = "any"
 
@@ -46,13 +55,13 @@ class MapCatalog(OpenFile):
         path = layout.catalog_path(data_dir)
         super().__init__(path, db, open_database(path))  # a robot's answer needs the catalog: it waits for no writer
         self.data_dir = data_dir
-        self._building: dict[tuple[str, int], int] = {}  # descriptors of locked folders
+        self._building_locks: dict[tuple[str, int], int] = {}  # descriptors of locked folders
 
     def close(self) -> None:
         """Close the file. Maps that are being built through this object count as abandoned from here on."""
         with self._lock:
-            for domain, version in list(self._building):
-                self._give_up_building(domain, version)
+            for domain, version in list(self._building_locks):
+                self._unlock_building(domain, version)
             super().close()
 
     def begin_map(self, domain: str, config: dict[str, Any]) -> int:
@@ -65,11 +74,11 @@ class MapCatalog(OpenFile):
             get_domain(db, domain)
             (version,) = db.execute("SELECT next_version FROM domain WHERE name = ?", [domain]).fetchone()
             db.table("domain").update(domain, {"next_version": version + 1})
-            row = {"domain": domain, "version": version, "state": MapState.BUILDING, "created_at": now()}
+            row = {"domain": domain, "version": version, "state": MapState.BUILDING, "created_at": current_moment()}
             db.table("map").insert({**row, "config": to_json(config), "metrics": "{}"})
             descriptor = lock_folder(layout.maps_folder(self.data_dir, domain), fcntl.LOCK_SH)
             assert descriptor is not None
-            self._building[domain, version] = descriptor
+            self._building_locks[domain, version] = descriptor
         return int(version)
 
     def seal_map(self, domain: str, version: int, sha256: str, file_bytes: int, metrics: dict[str, Any]) -> MapRecord:
@@ -84,10 +93,10 @@ class MapCatalog(OpenFile):
             _check_is_building(db, domain, version)
             if not path.is_file() or path.stat().st_size != file_bytes:
                 raise DamagedMapError(f"{path.name} is not the file that was sealed", file=path.name)
-            sealed = {"state": MapState.SEALED, "sha256": sha256, "file_bytes": file_bytes, "metrics": to_json(metrics)}
-            db.table("map").update((domain, version), sealed)
+            row = {"state": MapState.SEALED, "sha256": sha256, "file_bytes": file_bytes, "metrics": to_json(metrics)}
+            db.table("map").update((domain, version), row)
             record = _get_map(db, domain, version)
-        self._give_up_building(domain, version)
+        self._unlock_building(domain, version)
         return record
 
     def discard_map(self, domain: str, version: int) -> None:
@@ -95,7 +104,7 @@ class MapCatalog(OpenFile):
         with self._writing() as db:
             _check_is_building(db, domain, version)
             self._discard(db, domain, version)
-        self._give_up_building(domain, version)
+        self._unlock_building(domain, version)
 
     def discard_abandoned_maps(self) -> list[str]:
         """Discard the maps that dead processes were building; returns one line for each.
@@ -103,12 +112,12 @@ class MapCatalog(OpenFile):
         Those of a domain wait for the next time while a living process builds one of it.
         """
         with self._writing() as db:
-            building = db.execute("SELECT domain, version FROM map WHERE state = 'building'").fetchall()
-            alive = {domain for domain, _ in building if self._is_built(domain)}
-            abandoned = [(domain, version) for domain, version in building if domain not in alive]
-            for domain, version in abandoned:
+            unfinished_maps = db.execute("SELECT domain, version FROM map WHERE state = 'building'").fetchall()
+            living_domains = {domain for domain, _ in unfinished_maps if self._is_built(domain)}
+            abandoned_maps = [(domain, version) for domain, version in unfinished_maps if domain not in living_domains]
+            for domain, version in abandoned_maps:
                 self._discard(db, domain, version)
-        return [f"discarded the unfinished map {version} of domain {domain}" for domain, version in abandoned]
+        return [f"discarded the unfinished map {version} of domain {domain}" for domain, version in abandoned_maps]
 
     def _discard(self, db: Database, domain: str, version: int) -> None:
         path = self.map_path(domain, version)
@@ -126,8 +135,8 @@ class MapCatalog(OpenFile):
             os.close(descriptor)
         return descriptor is None
 
-    def _give_up_building(self, domain: str, version: int) -> None:
-        descriptor = self._building.pop((domain, version), None)
+    def _unlock_building(self, domain: str, version: int) -> None:
+        descriptor = self._building_locks.pop((domain, version), None)
         if descriptor is not None:
             os.close(descriptor)
 
@@ -141,35 +150,36 @@ class MapCatalog(OpenFile):
             LostActivationError: Another version was activated meanwhile.
         """
         with self._writing() as db:
-            active = get_domain(db, domain).active_version
-            chosen = _get_map(db, domain, version)
-            if chosen.removed_at is not None:
-                raise removed(domain, version)
-            if chosen.state is MapState.BUILDING:
+            active_version = get_domain(db, domain).active_version
+            record = _get_map(db, domain, version)
+            if record.removed_at is not None:
+                raise removal_error(domain, version)
+            if record.state is MapState.BUILDING:
                 raise UnknownMapVersionError(
                     f"map version {version} of domain {domain} is still being built", version=version
                 )
-            if expected is not ANY and active != expected:
+            if expected is not ANY and active_version != expected:
                 raise LostActivationError(
-                    f"domain {domain} serves {_named(active)}, not {_named(expected)}: look again before you swap",
-                    active=active,
+                    f"domain {domain} serves {_version_label(active_version)}, not {_version_label(expected)}: look "
+                    "again before you swap",
+                    active=active_version,
                     expected=expected,
                 )
-            if active != version:
+            if active_version != version:
                 # Which one served last must be known though the clock was set back: it is the one to roll back to.
-                (latest,) = db.execute("SELECT max(retired_at) FROM map WHERE domain = ?", [domain]).fetchone()
-                if active is not None:
-                    retired = {"state": MapState.RETIRED, "retired_at": now(behind=latest)}
-                    db.table("map").update((domain, active), retired)
-                db.table("map").update((domain, version), {"state": MapState.ACTIVE, "activated_at": now()})
+                (last_retired_at,) = db.execute("SELECT max(retired_at) FROM map WHERE domain = ?", [domain]).fetchone()
+                if active_version is not None:
+                    row = {"state": MapState.RETIRED, "retired_at": current_moment(behind=last_retired_at)}
+                    db.table("map").update((domain, active_version), row)
+                db.table("map").update((domain, version), {"state": MapState.ACTIVE, "activated_at": current_moment()})
             return _get_map(db, domain, version)
 
-    def kept_maps(self, domain: str | None = None, more_than: int = -1) -> list[KeptMap]:
+    def kept_maps(self, domain: str | None = None, min_beside: int = -1) -> list[KeptMap]:
         """The sealed versions that still have their files, by domain, oldest first.
 
         Args:
-            domain: Of this one; None: of all.
-            more_than: Only of domains that have more than so many beside the one that serves.
+            domain: Whose versions; None: those of all.
+            min_beside: Only those of domains that have more than so many beside the one that serves.
         """
         with self._reading() as db:
             rows = db.execute(
@@ -181,7 +191,7 @@ class MapCatalog(OpenFile):
                     GROUP BY domain HAVING sum(state != 'active') > ?
                 ) ORDER BY domain, version
                 """,
-                [domain, more_than],
+                [domain, min_beside],
             )
             return [KeptMap(domain, version, MapState(state), *times) for domain, version, state, *times in rows]
 
@@ -200,17 +210,17 @@ class MapCatalog(OpenFile):
             get_domain(db, domain)
             record = _get_map(db, domain, version)
             if record.removed_at is not None:
-                raise removed(domain, version)
-            named, why = f"map {version} of domain {domain}", None
+                raise removal_error(domain, version)
+            label, reason = f"map {version} of domain {domain}", None
             if record.state is MapState.ACTIVE:
-                why = f"{named} serves: activate another version first"
+                reason = f"{label} serves: activate another version first"
             elif record.state is MapState.BUILDING:
-                why = f"{named} is being built: cancel the job that builds it"
+                reason = f"{label} is being built: cancel the job that builds it"
             elif is_pinned():
-                why = f"a session lives on {named}: end it or wait for its end"
-            if why is not None:
-                raise MapInUseError(why, map_version=version)
-            db.table("map").update((domain, version), {"state": MapState.RETIRED, "removed_at": now()})
+                reason = f"a session lives on {label}: end it or wait for its end"
+            if reason is not None:
+                raise MapInUseError(reason, map_version=version)
+            db.table("map").update((domain, version), {"state": MapState.RETIRED, "removed_at": current_moment()})
         with self._lock:  # marked first: after a crash between the two the next start removes the file
             self._unlink(domain, version)
 
@@ -221,13 +231,13 @@ class MapCatalog(OpenFile):
             sync(path.parent)
         return was_there
 
-    def newest_maps(self, domain: str, before: int | None, limit: int) -> ListPage[MapRecord, int]:
-        """A page of a domain's map versions, newest first, behind version `before`; raises UnknownDomainError."""
+    def newest_maps(self, domain: str, last_key: int | None, limit: int) -> ListPage[MapRecord, int]:
+        """A page of a domain's map versions, newest first, behind version `last_key`; raises UnknownDomainError."""
         with self._reading() as db:
             get_domain(db, domain)
             rows = db.execute(
                 f"{_SELECT_MAP} WHERE domain = ? AND version < ? ORDER BY version DESC LIMIT ?",
-                [domain, _MAX_INTEGER if before is None else before, limit + 1],
+                [domain, _MAX_INTEGER if last_key is None else last_key, limit + 1],
             )
             return ListPage.of(((record.version, record) for record in map(_map, rows)), limit)
 
@@ -242,11 +252,11 @@ class MapCatalog(OpenFile):
             return _get_map(db, domain, version)
 
     def map_anywhere(self, domain: str, version: int) -> MapRecord:
-        """As `map`, where maps are shared also of a version that another machine has published this moment."""
+        """As `map`; a catalog that is shared also finds a version that another machine has published this moment."""
         return self.map(domain, version)
 
     def settled_map(self, domain: str, version: int) -> MapRecord:
-        """As `map`, behind every change that this process is about to make: a removal is done, or has not begun."""
+        """As `map`, after any change that this process is making: a removal is done, or has not begun."""
         with self._lock:
             return self.map(domain, version)
 
@@ -295,9 +305,9 @@ def _get_map(db: Database, domain: str, version: int) -> MapRecord:
     if 1 <= version <= _MAX_INTEGER:
         row = db.execute(f"{_SELECT_MAP} WHERE domain = ? AND version = ?", [domain, version]).fetchone()
     if row is None:
-        known = db.execute("SELECT version FROM map WHERE domain = ? ORDER BY version DESC", [domain]).fetchall()
-        there = nearest_of("", (str(version) for (version,) in known))
-        raise UnknownMapVersionError(f"domain {domain} has no map version {version}{there}", version=version)
+        rows = db.execute("SELECT version FROM map WHERE domain = ? ORDER BY version DESC", [domain]).fetchall()
+        suggestion = nearest_of("", (str(version) for (version,) in rows))
+        raise UnknownMapVersionError(f"domain {domain} has no map version {version}{suggestion}", version=version)
     return _map(row)
 
 
@@ -313,8 +323,8 @@ def _check_is_building(db: Database, domain: str, version: int) -> None:
         raise UnknownMapVersionError(f"domain {domain} is not building a map version {version}", version=version)
 
 
-def removed(domain: str, version: int) -> RetiredMapError:
-    """What is said of a version whose file is no more."""
+def removal_error(domain: str, version: int) -> RetiredMapError:
+    """The error for a version whose file was removed."""
     return RetiredMapError(
         f"map {version} of domain {domain} was retired and its file removed: it cannot serve again",
         domain=domain,
@@ -322,5 +332,5 @@ def removed(domain: str, version: int) -> RetiredMapError:
     )
 
 
-def _named(version: object) -> str:
+def _version_label(version: object) -> str:
     return "no map" if version is None else f"map version {version}"

@@ -53,16 +53,16 @@ def look_at(path: Path, ask: Callable[[Database], T]) -> T:
     A file whose log is empty is read as one that does not change, which works on a read-only disk too, and is read
     again where it has changed meanwhile.
     """
-    before = file_state(path)
-    if before[-1] == 0:
+    state = file_state(path)
+    if state[-1] == 0:
         try:
             with open_database(path, immutable=True) as db:
                 answer = ask(db)
         except BaseException:
-            if file_state(path) == before:
+            if file_state(path) == state:
                 raise
         else:
-            if file_state(path) == before:
+            if file_state(path) == state:
                 return answer
     with open_database(path, read_only=True) as db:
         return ask(db)
@@ -106,19 +106,19 @@ def pending_migrations(db: Database, migrations: Migrations, path: Path) -> bool
     if db.execute(_STRANGE_SCHEMA).fetchone() is not None:
         raise DamagedFileError(f"{path.name} is damaged: it holds what no release writes", file=path.name)
     try:
-        pending = {migration.name for migration in migrations.pending(db)}
-        applied = {migration.name for migration in migrations.applied(db)}
+        pending_names = {migration.name for migration in migrations.pending(db)}
+        applied_names = {migration.name for migration in migrations.applied(db)}
     except (AttributeError, LookupError, TypeError, ValueError) as error:  # a bookkeeping table of another shape
         raise DamagedFileError(f"{path.name} is damaged: its schema cannot be read", file=path.name) from error
-    if not applied and db.table_names():
+    if not applied_names and db.table_names():
         raise DamagedFileError(f"{path.name} is a SQLite file of another kind", file=path.name)
-    with Database(memory=True, execute_plugins=False) as nothing:
-        newer = applied - {migration.name for migration in migrations.pending(nothing)}
-    if newer:
+    with Database(memory=True, execute_plugins=False) as empty_db:
+        newer_names = applied_names - {migration.name for migration in migrations.pending(empty_db)}
+    if newer_names:
         raise DamagedFileError(
-            f"{path.name} was written by a newer release (schema {max(newer)}): upgrade this one", file=path.name
+            f"{path.name} was written by a newer release (schema {max(newer_names)}): upgrade this one", file=path.name
         )
-    return bool(pending)
+    return bool(pending_names)
 
 
 @contextmanager
@@ -174,9 +174,9 @@ class OpenFile:
         with self._lock, self._reader_lock:
             if self._reader is not self._db:
                 self._reader.close()
-                with suppress(sqlite3.Error), open_database(self._path, read_only=True) as last:
+                with suppress(sqlite3.Error), open_database(self._path, read_only=True) as reader:
                     self._db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-                    last.execute("SELECT 1 FROM sqlite_schema LIMIT 1").fetchall()  # a reader that is last leaves it
+                    reader.execute("SELECT 1 FROM sqlite_schema LIMIT 1").fetchall()  # the last to close leaves the log
                     self._db.close()
             self._db.close()
 
@@ -206,16 +206,16 @@ class OpenFile:
         self.check_is_there()
 
     def check_is_there(self) -> None:
-        """Raise `_gone` where the file is gone, or another lies in its place; an open one goes on without its name."""
+        """Raise `_removal_error` where the file is gone or another lies in its place: an open file would not notice."""
         with storage_faults(self._path):
             try:
                 is_there = self._path.stat().st_ino == self._inode
             except FileNotFoundError:
                 is_there = False
         if not is_there:
-            raise self._gone()
+            raise self._removal_error()
 
-    def _gone(self) -> DeepSimbadError:
+    def _removal_error(self) -> DeepSimbadError:
         return DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
 
 
@@ -231,8 +231,8 @@ class GroupCommit:
     ) -> None:
         self._transaction = transaction
         self._on_commit = on_commit
-        self._waiting: SimpleQueue[list[_Write] | None] = SimpleQueue()
-        self._of_this_turn: list[_Write] = []
+        self._queue: SimpleQueue[list[_Write] | None] = SimpleQueue()
+        self._turn_writes: list[_Write] = []
         self._is_crowded = False  # whether there were several at the last turn
         self._is_idle = False
         self._is_open = True
@@ -251,8 +251,8 @@ class GroupCommit:
                 this turn, which it is while many are, or another transaction is under way: then it cannot be waited for
                 before the turn ends.
         """
-        done: Future[T] = Future()
-        done.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
+        future: Future[T] = Future()
+        future.set_running_or_notify_cancel()  # whoever stops waiting does not undo it; before the thread can end it
         try:
             loop = asyncio.get_running_loop() if by_turns else None
         except RuntimeError:
@@ -262,18 +262,18 @@ class GroupCommit:
                 raise UnavailableError("the service is shutting down")
             if loop is None or (self._is_idle and not self._is_crowded):
                 self._is_idle = False
-                self._waiting.put([(run, done)])
-                return done
-            if not self._of_this_turn:
+                self._queue.put([(run, future)])
+                return future
+            if not self._turn_writes:
                 loop.call_soon(self._hand_over)  # behind all that is ready now
-            self._of_this_turn.append((run, done))
-        return done
+            self._turn_writes.append((run, future))
+        return future
 
     def _hand_over(self) -> None:
         with self._lock:
-            self._waiting.put(self._of_this_turn)
-            self._is_crowded = len(self._of_this_turn) > 1
-            self._of_this_turn = []
+            self._queue.put(self._turn_writes)
+            self._is_crowded = len(self._turn_writes) > 1
+            self._turn_writes = []
 
     def close(self) -> None:
         """Commit what waits, then end the thread."""
@@ -281,18 +281,18 @@ class GroupCommit:
             was_open, self._is_open = self._is_open, False
         if was_open:
             self._hand_over()
-            self._waiting.put(None)
+            self._queue.put(None)
         self.thread.join()
 
     def _work(self) -> None:
         while True:
-            self._is_idle = self._waiting.empty()
-            writes = self._waiting.get()
+            self._is_idle = self._queue.empty()
+            writes = self._queue.get()
             if writes is None:
                 return
             batch = writes
-            while len(batch) < MAX_BATCH and not self._waiting.empty():
-                writes = self._waiting.get()
+            while len(batch) < MAX_BATCH and not self._queue.empty():
+                writes = self._queue.get()
                 if writes is None:
                     break
                 batch += writes
@@ -315,5 +315,5 @@ class GroupCommit:
                 self._commit([write])
             return
         self._on_commit(len(batch))
-        for (_, done), result in zip(batch, results, strict=True):
-            done.set_result(result)
+        for (_, future), result in zip(batch, results, strict=True):
+            future.set_result(result)

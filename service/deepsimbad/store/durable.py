@@ -63,11 +63,13 @@ _SENTENCES = {
 
 
 @contextmanager
-def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError] = DamagedFileError) -> Iterator[None]:
+def storage_faults(
+    path: Path, damage_error: type[DamagedFileError | DamagedMapError] = DamagedFileError
+) -> Iterator[None]:
     """Turn what SQLite and the system raise inside the block into errors of the product that name the file.
 
-    UnavailableError where the disk is full, read-only, busy, ... (`hints["reason"]`), DamagedFileError (or `damaged`)
-    where the content is not that of such a file, InvalidInputError where the schema refuses a value.
+    UnavailableError where the disk is full, read-only, busy, ... (`hints["reason"]`), `damage_error` where the content
+    is not that of such a file, InvalidInputError where the schema refuses a value.
     """
     try:
         yield
@@ -79,7 +81,7 @@ def storage_faults(path: Path, damaged: type[DamagedFileError | DamagedMapError]
         if code in _INPUT_CODES:
             raise InvalidInputError(f"{path.name} cannot hold this: {error}") from error
         if code not in _REASONS_BY_SQLITE:
-            raise damaged(f"{path.name} is damaged: {error}", file=path.name) from error
+            raise damage_error(f"{path.name} is damaged: {error}", file=path.name) from error
         raise _unavailable(path, _REASONS_BY_SQLITE[code]) from error
     except MemoryError as error:  # SQLite's is raised as this one too
         raise _unavailable(path, "out_of_memory") from error
@@ -101,8 +103,8 @@ def sync(path: Path) -> None:
 
 
 @contextmanager
-def written_aside(file: Path, what: str) -> Iterator[Path]:
-    """Let a new file, `what` ("a backup"), appear whole or not at all, and never in the place of another.
+def written_aside(file: Path, label: str) -> Iterator[Path]:
+    """Let a new file, which errors call `label` ("a backup"), appear whole or not at all, and never replace another.
 
     Yields a path to write it at, in a folder beside it that holds whatever else is needed meanwhile and goes away.
 
@@ -111,22 +113,22 @@ def written_aside(file: Path, what: str) -> Iterator[Path]:
         ConflictError: There is a file of that name.
         OSError: The disk is full, ...
     """
-    taken = ConflictError(f"{file} exists: {what} never replaces a file, choose another name")
+    conflict = ConflictError(f"{file} exists: {label} never replaces a file, choose another name")
     if not file.parent.is_dir():
-        raise InvalidInputError(f"there is no folder {file.parent} for {what}")
+        raise InvalidInputError(f"there is no folder {file.parent} for {label}")
     if file.exists():
-        raise taken
+        raise conflict
     folder = Path(tempfile.mkdtemp(prefix=f".{file.name}.", suffix=".part", dir=file.parent))
     try:
-        new = folder / file.name
-        yield new
-        sync(new)
+        new_path = folder / file.name
+        yield new_path
+        sync(new_path)
         try:
-            os.link(new, file)  # unlike a rename it never replaces
+            os.link(new_path, file)  # unlike a rename it never replaces
         except FileExistsError as error:
-            raise taken from error
+            raise conflict from error
         except OSError:  # a file system without hard links
-            new.rename(file)
+            new_path.rename(file)
         sync(file.parent)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -160,10 +162,10 @@ def remove_database(path: Path) -> bool:
 
     The file itself goes first: a journal without its file is ignored, a file without its journal may be wrong.
     """
-    existed = path.exists()
+    was_there = path.exists()
     for suffix in ("", "-journal", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
-    return existed
+    return was_there
 
 
 def bury(folder: Path) -> None:
@@ -206,11 +208,12 @@ def make_data_dir(data_dir: Path) -> None:
 
 
 @contextmanager
-def service_lock(data_dir: Path, about: str) -> Iterator[None]:
+def service_lock(data_dir: Path, description: str) -> Iterator[None]:
     """Hold a data directory, made where it is missing, as its one service until the end of the block or process.
 
     Two services would each keep sessions in memory that the other does not know of; commands take no lock. The folder
-    itself is locked, which cannot be taken away while its files are in use; a file in it says where it listens.
+    itself is locked, which cannot be taken away while its files are in use; a file in it holds the `description`: where
+    the service listens, or what has the folder instead of one.
 
     Raises:
         DataDirInUseError: Another service has it.
@@ -234,7 +237,7 @@ def service_lock(data_dir: Path, about: str) -> Iterator[None]:
     try:
         with storage_faults(data_dir):
             try:
-                file.write_text(json.dumps({"pid": os.getpid(), "address": about}), encoding="utf-8")
+                file.write_text(json.dumps({"pid": os.getpid(), "address": description}), encoding="utf-8")
             except OSError as error:
                 if error.errno != errno.ENOSPC:  # then it holds all the same, and only cannot say whose it is
                     raise

@@ -14,11 +14,11 @@ def is_name(name: str) -> bool:
     return re.fullmatch(NAME_PATTERN, name) is not None
 
 
-def checked_name(name: str, what: str) -> str:
+def checked_name(name: str, kind: str) -> str:
     """The name itself, safe to become part of a path; raises InvalidInputError."""
     if not is_name(name):
         raise InvalidInputError(
-            f"a {what} is named by 1 to 64 letters, digits, '.', '_' or '-', the first a letter or digit",
+            f"a {kind} is named by 1 to 64 letters, digits, '.', '_' or '-', the first a letter or digit",
             pattern=NAME_PATTERN,
         )
     return name

@@ -33,7 +33,7 @@ from deepsimbad.store.arrays import (
     unpack_texts,
 )
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import removed
+from deepsimbad.store.catalog_maps import removal_error
 from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, verify, written_aside
 from deepsimbad.store.records import MapRecord, from_json, to_json
@@ -111,8 +111,8 @@ def _write(db: Database, map_: Map, blocks: list[bytes], on_progress: Callable[[
         name: pack_texts(array) if name in _TEXTS else array for name, array in map_.arrays().items() if name != "lists"
     }
     for table in _TABLES:
-        of_table = {name: array for name, array in arrays.items() if _TABLE_OF.get(name, "calibration") == table}
-        (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, of_table, checksum)
+        table_arrays = {name: array for name, array in arrays.items() if _TABLE_OF.get(name, "calibration") == table}
+        (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, table_arrays, checksum)
         on_progress(0.7)
     db.table("map").insert({"id": 1, **description, "checksum": checksum.value})
 
@@ -127,7 +127,7 @@ def read_map(path: Path) -> Map:
         UnavailableError: The disk failed, no memory is left, ...: the file may be whole.
     """
     try:
-        with _opened(path) as db:
+        with _open_map(path) as db:
             return _read(db, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, RecursionError) as error:
         raise DamagedMapError(f"{path.name} is damaged: {error}", file=path.name) from error
@@ -139,9 +139,9 @@ def _read(db: Database, path: Path) -> Map:
     rows = list(db.table("map").rows)
     if not rows:
         raise DamagedMapError(f"{path.name} is damaged: it was never finished", file=path.name)
-    stored = rows[0]
+    row = rows[0]
     checksum = Checksum()
-    checksum.add(*(stored[column] for column in _DESCRIPTION))
+    checksum.add(*(row[column] for column in _DESCRIPTION))
     blocks = [body for (body,) in db.execute("SELECT body FROM posting WHERE landmark IS NULL ORDER BY part")]
     checksum.add(*blocks)
     postings = db.execute(  # of an earlier release
@@ -153,15 +153,15 @@ def _read(db: Database, path: Path) -> Map:
     arrays: dict[str, NDArray[Any]] = {}
     for table in _TABLES:
         arrays |= (load_packed if table == _PACKED_TABLE else load_arrays)(db, table, checksum)
-    if checksum.value != stored["checksum"]:
+    if checksum.value != row["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
-    arrays |= {name: unpack_texts(arrays[name], stored[_TEXTS[name]]) for name in _TEXTS.keys() & arrays.keys()}
-    shape = stored["list_length"], stored["n_map_images"]
+    arrays |= {name: unpack_texts(arrays[name], row[_TEXTS[name]]) for name in _TEXTS.keys() & arrays.keys()}
+    shape = row["list_length"], row["n_map_images"]
     if postings:
         arrays["lists"] = unpack_postings(postings, *shape)
     else:
-        arrays["lists"] = unpack_lists(blocks, *shape, stored["n_landmarks"], model.get("prototypes"))
-    document = {name: from_json(stored[name]) if name in _AS_JSON else stored[name] for name in _DESCRIPTION}
+        arrays["lists"] = unpack_lists(blocks, *shape, row["n_landmarks"], model.get("prototypes"))
+    document = {name: from_json(row[name]) if name in _AS_JSON else row[name] for name in _DESCRIPTION}
     return Map.from_arrays(document, model, arrays, _bytes_by_table(db)["posting"])
 
 
@@ -172,7 +172,7 @@ def index_bytes(path: Path) -> int:
 
 def table_bytes(path: Path) -> dict[str, int]:
     """The pages of every table with its indexes, in bytes; raises as `read_map`."""
-    with _opened(path) as db:
+    with _open_map(path) as db:
         return _bytes_by_table(db)
 
 
@@ -187,7 +187,7 @@ def _bytes_by_table(db: Database) -> dict[str, int]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Database]:
+def _open_map(path: Path) -> Iterator[Database]:
     """A map file open for reading, of today's schema."""
     if not path.is_file():
         raise DamagedMapError(f"{path.name} is missing", file=path.name)
@@ -199,8 +199,8 @@ def _opened(path: Path) -> Iterator[Database]:
             with open_database(path, immutable=True) as db:
                 if not db.table_names():
                     raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
-                with in_todays_schema(db, migrations, path) as current:
-                    yield current
+                with in_todays_schema(db, migrations, path) as current_db:
+                    yield current_db
     except DamagedFileError as error:
         raise DamagedMapError(error.message, **error.hints) from error
 
@@ -221,18 +221,18 @@ def _fitting_page_size(block_lengths: Sequence[int]) -> int:
             room -= local
         return n_pages * page_size
 
-    least = min(map(cost, _PAGE_SIZES))
-    return next(size for size in _PAGE_SIZES if cost(size) <= _WORTH_SMALLER_PAGES * least)
+    min_bytes = min(map(cost, _PAGE_SIZES))
+    return next(size for size in _PAGE_SIZES if cost(size) <= _WORTH_SMALLER_PAGES * min_bytes)
 
 
 def _spill(payload: int, page_size: int) -> tuple[int, int]:
     """The bytes of a row that stay in its page, and its overflow pages (SQLite file format, 1.6)."""
-    most, least = page_size - 35, (page_size - 12) * 32 // 255 - 23
-    if payload <= most:
+    max_local, min_local = page_size - 35, (page_size - 12) * 32 // 255 - 23
+    if payload <= max_local:
         return payload, 0
-    local = least + (payload - least) % (page_size - 4)
-    if local > most:
-        local = least
+    local = min_local + (payload - min_local) % (page_size - 4)
+    if local > max_local:
+        local = min_local
     return local, -(-(payload - local) // (page_size - 4))
 
 
@@ -323,14 +323,14 @@ def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -
             raise NoActiveMapError(f"domain {domain} has no active map: name another with --version", domain=domain)
     record = catalog.map(domain, version)
     if record.removed_at is not None:
-        raise removed(domain, version)
+        raise removal_error(domain, version)
     if record.sha256 is None:
         raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
     try:
-        with storage_faults(file), written_aside(file, "an export") as new:
-            shutil.copyfile(catalog.map_file(domain, version), new)
-            verify(new, record.sha256)
-            new.chmod(0o444)
+        with storage_faults(file), written_aside(file, "an export") as new_path:
+            shutil.copyfile(catalog.map_file(domain, version), new_path)
+            verify(new_path, record.sha256)
+            new_path.chmod(0o444)
     except DamagedMapError as error:
         raise DamagedMapError(
             f"map {version} of domain {domain} is damaged and was not exported: {error.message}",

@@ -29,7 +29,7 @@ from deepsimbad.store.records import to_json
 
 _STATE = "state.json.gz"
 _MOST_AT_ONCE = 32  # entries that are asked for together
-_N_LOCKS = 16  # of two files that are asked for seldom the same
+_N_LOCKS = 16  # so many that two files which are fetched at once seldom share one
 
 
 class MapStore:
@@ -56,22 +56,22 @@ class MapStore:
         if (founding := self._objects.get(name)) is None:
             self._objects.create(name, to_json({"store_id": uuid4().hex}).encode())
             founding = self._objects.get(name) or b"{}"
-        return str(_parsed(founding, name).get("store_id"))
+        return str(_parse(founding, name).get("store_id"))
 
-    def entries(self, after: int) -> Iterator[tuple[int, dict[str, Any]]]:
-        """The log's entries behind a number, each with its own; one request where there is none yet.
+    def entries(self, position: int) -> Iterator[tuple[int, dict[str, Any]]]:
+        """(number, entry) of the log's entries behind number `position`; one request where there is none yet.
 
-        Raises UnavailableError: the entry of that number is gone, and the log with it.
+        Raises UnavailableError: the entry at `position` is gone, and the log with it.
         """
         n_at_once = 1
         while True:
-            names = [_entry_name(after + 1 + number) for number in range(n_at_once)]
+            names = [_entry_name(position + 1 + number) for number in range(n_at_once)]
             for name, content in zip(names, self._read(names), strict=True):
                 if content is None:
-                    self._check_is_there(after)
+                    self._check_is_there(position)
                     return
-                after += 1
-                yield after, _parsed(content, name)
+                position += 1
+                yield position, _parse(content, name)
             n_at_once = min(2 * n_at_once, _MOST_AT_ONCE)
 
     def _read(self, names: Sequence[str]) -> list[bytes | None]:
@@ -94,10 +94,10 @@ class MapStore:
     def state(self) -> dict[str, Any] | None:
         """All domains as of an entry, `{"position", "domains": {name: ...}}`; None: the log is short."""
         content = self._objects.get(_STATE)
-        return None if content is None else _parsed(content, _STATE)
+        return None if content is None else _parse(content, _STATE)
 
     def put_state(self, state: Mapping[str, Any]) -> None:
-        """Write `state`; of two who do at once either may remain."""
+        """Write what `state` reads; where two do so at once either may remain."""
         self._objects.put(_STATE, gzip.compress(to_json(state).encode()))
 
     # Maps
@@ -123,25 +123,25 @@ class MapStore:
         """Read the objects of maps whole; answers what is wrong with them."""
         findings = []
         for n_read, sha256 in enumerate(digests, start=1):
-            digest, what = hashlib.sha256(), None
+            digest, problem = hashlib.sha256(), None
             try:
                 for piece in self.map_pieces(sha256):
                     digest.update(piece)
             except DamagedMapError:
-                what = "is missing"
+                problem = "is missing"
             else:
-                what = None if digest.hexdigest() == sha256 else "is another file: its SHA-256 differs"
-            if what is not None:
-                findings.append(Finding(f"{self.url}/{_map_name(sha256)}", what))
+                problem = None if digest.hexdigest() == sha256 else "is another file: its SHA-256 differs"
+            if problem is not None:
+                findings.append(Finding(f"{self.url}/{_map_name(sha256)}", problem))
             on_progress(n_read / len(digests))
         return findings
 
 
 class MapCache:
-    """Files of a store's maps that lie here too, at most so many bytes of them; those asked for longest ago go first.
+    """Files of a store's maps that lie here too, `most_bytes` of them (None: any number); the least recent go first.
 
-    `files` lists them, those that are not the store's among them, and `may_go` tells of one whether it can be fetched
-    again and is not in use. Of `most_bytes` None is any number. Usable from any thread.
+    `files` lists the files of maps here, the store's and others; `may_go` says whether one can be fetched again and is
+    not in use. Usable from any thread.
     """
 
     def __init__(
@@ -152,28 +152,28 @@ class MapCache:
         most_bytes: int | None,
     ) -> None:
         self._store, self._files, self._may_go, self._most_bytes = store, files, may_go, most_bytes
-        self._asking = tuple(threading.Lock() for _ in range(_N_LOCKS))
-        self._making_room, self._n_coming = threading.Lock(), 0
+        self._fetch_locks = tuple(threading.Lock() for _ in range(_N_LOCKS))
+        self._room_lock, self._n_fetching_bytes = threading.Lock(), 0
 
     @contextmanager
-    def asked_for(self, path: Path) -> Iterator[None]:
-        """Whoever else asks for a file waits meanwhile, so that it is fetched once."""
-        with self._asking[hash(path) % _N_LOCKS]:
+    def fetch_lock(self, path: Path) -> Iterator[None]:
+        """Let one thread at a time look for a file, so that it is fetched once."""
+        with self._fetch_locks[hash(path) % _N_LOCKS]:
             yield
             with suppress(OSError):  # a disk that may only be read
                 os.utime(path)
 
     def fetch(self, path: Path, sha256: str, n_bytes: int) -> None:
         """Bring a map here; raises DamagedMapError, and UnavailableError too where there is no room."""
-        with self._making_room:
+        with self._room_lock:
             if self._most_bytes is not None:
-                self._make_room(self._n_coming + n_bytes, self._most_bytes)
-            self._n_coming += n_bytes  # until they are a file there
+                self._make_room(self._n_fetching_bytes + n_bytes, self._most_bytes)
+            self._n_fetching_bytes += n_bytes  # until they are a file there
         try:
             fetch(self._store.map_pieces(sha256), path, sha256)
         finally:
-            with self._making_room:
-                self._n_coming -= n_bytes
+            with self._room_lock:
+                self._n_fetching_bytes -= n_bytes
 
     def _make_room(self, n_bytes: int, most_bytes: int) -> None:
         files = []
@@ -204,7 +204,7 @@ def _entry_name(number: int) -> str:
     return f"log/{number:012d}.json"
 
 
-def _parsed(content: bytes, name: str) -> dict[str, Any]:
+def _parse(content: bytes, name: str) -> dict[str, Any]:
     try:
         return dict(json.loads(gzip.decompress(content) if name.endswith(".gz") else content))
     except (ValueError, TypeError, EOFError, OSError) as error:

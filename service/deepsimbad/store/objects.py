@@ -14,7 +14,7 @@ from deepsimbad.store.durable import sync
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-# An answer is waited for by somebody: the library's own patience is three minutes.
+# Somebody waits for the answer, and the library itself would go on trying for three minutes.
 _RETRIES = {"max_retries": 2, "retry_timeout": timedelta(seconds=10)}
 _CLIENT = {
     "connect_timeout": timedelta(seconds=5),
@@ -119,26 +119,26 @@ class Objects:
         except FileNotFoundError:
             return None
 
-    def names(self, prefix: str, after: str | None = None) -> Iterator[str]:
-        """The names below a prefix, which ends at a `/`, that follow one; a thousand a request, in no stated order."""
-        return (entry.name for entry in self.entries(prefix, after))
+    def names(self, prefix: str, previous_name: str | None = None) -> Iterator[str]:
+        """The names below a prefix (ending in `/`) that follow `previous_name`: a thousand a request, unordered."""
+        return (entry.name for entry in self.entries(prefix, previous_name))
 
-    def entries(self, prefix: str, after: str | None = None) -> "Iterator[Entry]":
-        """As `names`, and what is listed of each."""
+    def entries(self, prefix: str, previous_name: str | None = None) -> "Iterator[Entry]":
+        """As `names`, with each object's size and time."""
         with self._faults(prefix):
-            for page in self._store.list(prefix, offset=after, chunk_size=1000):
-                for each in page:
-                    yield Entry(each["path"], each["size"], each["last_modified"].timestamp())
+            for page in self._store.list(prefix, offset=previous_name, chunk_size=1000):
+                for attributes in page:
+                    yield Entry(attributes["path"], attributes["size"], attributes["last_modified"].timestamp())
 
-    def copy(self, name: str, to: Path) -> None:
-        """An object as a file of its time, there whole or not at all; raises FileNotFoundError."""
-        part = to.with_name(f".{to.name}.{os.getpid()}.part")
+    def copy(self, name: str, target: Path) -> None:
+        """Copy an object into a file of the same time, which is there whole or not at all; raises FileNotFoundError."""
+        part = target.with_name(f".{target.name}.{os.getpid()}.part")
         with self._faults(name):
-            given = self._store.get(name)
-            part.write_bytes(given.bytes().to_bytes())
-            modified = given.meta["last_modified"].timestamp()
+            download = self._store.get(name)
+            part.write_bytes(download.bytes().to_bytes())
+            modified = download.meta["last_modified"].timestamp()
         os.utime(part, (modified, modified))
-        part.replace(to)
+        part.replace(target)
 
     def delete(self, name: str) -> None:
         """Remove an object, if there is one."""
@@ -155,17 +155,17 @@ class Objects:
         except (AlreadyExistsError, DeepSimbadError):
             raise
         except (BaseError, OSError, NotImplementedError) as error:
-            told = str(error)  # what lists and missing buckets answer has no class of its own
-            if isinstance(error, (PermissionDeniedError, UnauthenticatedError)) or "403 Forbidden" in told:
+            message = str(error)  # what lists and missing buckets answer has no class of its own
+            if isinstance(error, (PermissionDeniedError, UnauthenticatedError)) or "403 Forbidden" in message:
                 raise self._unavailable(name, "refused", "it refuses the credentials") from error
-            if "NoSuchBucket" in told:
+            if "NoSuchBucket" in message:
                 raise self._unavailable(name, "no_bucket", "it has no such bucket") from error
             if isinstance(error, FileNotFoundError):
                 raise
             raise self._unavailable(name, "unreachable", _first_line(error)) from error
 
-    def _unavailable(self, name: str, reason: str, why: str) -> UnavailableError:
-        return UnavailableError(f"the map store {self.url} cannot be used: {why}", reason=reason, object=name)
+    def _unavailable(self, name: str, reason: str, detail: str) -> UnavailableError:
+        return UnavailableError(f"the map store {self.url} cannot be used: {detail}", reason=reason, object=name)
 
     def _sync(self, name: str) -> None:
         """Wait for the disk where the store is a folder, which the library does not."""

@@ -25,9 +25,9 @@ class Spool(OpenFile):
 
     @property
     def spooled_bytes(self) -> int:
-        """Of all pictures that wait."""
+        """The bytes of all pictures that wait."""
         with self._reading() as db:
-            return spooled(db)[1]
+            return spool_size(db)[1]
 
     def picture(self, index: int) -> bytes | None:
         """A frame's picture as it was sent; None: it does not wait here."""
@@ -64,7 +64,7 @@ class Spool(OpenFile):
                 self._db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
-def spooled(db: Database) -> tuple[int, int]:
+def spool_size(db: Database) -> tuple[int, int]:
     """How many pictures wait, and their bytes."""
     n_spooled, n_bytes = db.execute("SELECT count(*), coalesce(sum(length(body)), 0) FROM spool").fetchone()
     return n_spooled, n_bytes
@@ -91,9 +91,9 @@ def spool_pictures(db: Database, indices: Sequence[int], pictures: Mapping[int, 
 
 
 class Thumbnails(OpenFile):
-    """Small pictures of one domain's frames, known by their encodings; usable from any thread and several processes.
+    """Small pictures of one domain's frames, by `Drive.digests`; usable from any thread and several processes.
 
-    They are an aside: a domain works without the file, and who wants its room back may remove it while nothing runs.
+    A domain works without the file, which may be removed while nothing runs to have its room back.
     """
 
     @classmethod
@@ -120,12 +120,12 @@ class Thumbnails(OpenFile):
 
     @property
     def n_bytes(self) -> int:
-        """Of all pictures."""
+        """The bytes of all pictures."""
         with self._reading() as db:
             (n_bytes,) = db.execute("SELECT coalesce(sum(length(body)), 0) FROM thumbnail").fetchone()
             return int(n_bytes)
 
 
 def _signed(digest: int) -> int:
-    """SQLite's integers have a sign."""
+    """A digest as one of SQLite's integers, which have a sign."""
     return digest - (1 << 64) if digest >= 1 << 63 else digest

@@ -39,7 +39,7 @@ class JobState(StrEnum):
 
     @property
     def is_final(self) -> bool:
-        """Whether nothing follows."""
+        """Whether no other state follows."""
         return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
@@ -49,14 +49,14 @@ class KeyScope(StrEnum):
     LOCALIZE = "localize"
     ADMIN = "admin"
 
-    def includes(self, needed: "KeyScope") -> bool:
-        """Whether a key of this scope may do what needs the other."""
-        return self is KeyScope.ADMIN or self is needed
+    def includes(self, scope: "KeyScope") -> bool:
+        """Whether a key of this scope may do what `scope` may."""
+        return self is KeyScope.ADMIN or self is scope
 
 
 @dataclass(frozen=True)
 class DomainRecord:
-    """One domain: `evaluator` as it was given, `closed` where the route is a loop, moves in metres; what it shows."""
+    """One domain: `evaluator` as it was given, `closed` where the route is a loop, `options` of what it shows."""
 
     name: str
     evaluator: dict[str, Any]
@@ -78,17 +78,18 @@ _SELECT_DOMAIN = """
 """
 
 
-def read_domains(db: Database, name: str | None = None, after: str = "", limit: int = -1) -> list[DomainRecord]:
-    """Every domain by name, at most `limit` behind the name `after`, or the one of that name if there is one."""
+def read_domains(db: Database, name: str | None = None, last_name: str = "", limit: int = -1) -> list[DomainRecord]:
+    """Domains in order of their names, at most `limit` behind `last_name`, or the one called `name` if there is one."""
     if name is not None and not is_name(name):  # such a name cannot exist, and need not be valid Unicode either
         return []
-    which, given = ("> ?", after) if name is None else ("= ?", name)
-    rows = db.execute(f"{_SELECT_DOMAIN} WHERE domain.name {which} ORDER BY domain.name LIMIT ?", [given, limit])
+    condition, bound = ("> ?", last_name) if name is None else ("= ?", name)
+    rows = db.execute(f"{_SELECT_DOMAIN} WHERE domain.name {condition} ORDER BY domain.name LIMIT ?", [bound, limit])
     return [
         DomainRecord(
-            name, from_json(evaluator), bool(closed), tuple(from_json(actions_m)), version, at, from_json(options)
+            *(name, from_json(evaluator), bool(closed), tuple(from_json(actions_m))),
+            *(version, created_at, from_json(options)),
         )
-        for name, evaluator, closed, actions_m, version, at, options in rows
+        for name, evaluator, closed, actions_m, version, created_at, options in rows
     ]
 
 
@@ -96,8 +97,8 @@ def get_domain(db: Database, name: str) -> DomainRecord:
     """The domain of that name; raises UnknownDomainError."""
     for record in read_domains(db, name):
         return record
-    present = [row[0] for row in db.execute("SELECT name FROM domain ORDER BY name LIMIT 20")]
-    raise UnknownDomainError(f"there is no domain {name!a}{nearest_of(name, present)}", known=present)
+    names = [row[0] for row in db.execute("SELECT name FROM domain ORDER BY name LIMIT 20")]
+    raise UnknownDomainError(f"there is no domain {name!a}{nearest_of(name, names)}", known=names)
 
 
 @dataclass(frozen=True)
@@ -162,9 +163,9 @@ class KeyRecord:
     expires_at: str | None
     revoked_at: str | None
 
-    def is_usable(self, at: str) -> bool:
-        """Whether it opens anything at a time (as `now` writes it)."""
-        return self.revoked_at is None and (self.expires_at is None or at < self.expires_at)
+    def is_usable(self, moment: str) -> bool:
+        """Whether it opens anything at a time (as `current_moment` writes it)."""
+        return self.revoked_at is None and (self.expires_at is None or moment < self.expires_at)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class ListPage(Generic[Record, Key]):
 
     @classmethod
     def of(cls, rows: Iterable[tuple[Key, Record]], limit: int) -> "ListPage[Record, Key]":
-        """The page of what a statement gave that asked for one record more than the `limit`."""
+        """The first `limit` of `rows` as a page, where one more was asked for to tell whether more follow."""
         rows = list(rows)
         page = rows[:limit]
         return cls(tuple(record for _, record in page), page[-1][0] if len(rows) > limit else None)
@@ -199,15 +200,15 @@ def from_json(text: str | None) -> Any:
     return None if text is None else json.loads(text)
 
 
-def now(behind: str | None = None) -> str:
-    """The present moment; texts sort as times do. It follows the moment `behind`, though the clock was set back."""
+def current_moment(behind: str | None = None) -> str:
+    """The present moment as text, which sorts as times do; later than `behind`, though the clock was set back."""
     moment = _text(datetime.now(UTC))
     if behind is None or moment > behind:
         return moment
     return _text(datetime.fromisoformat(behind) + timedelta(milliseconds=1))
 
 
-def after(wait: timedelta) -> str:
+def moment_after(wait: timedelta) -> str:
     """The moment that follows now by `wait`; raises InvalidInputError past the year 9999."""
     try:
         return _text(datetime.now(UTC) + wait)

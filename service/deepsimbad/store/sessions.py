@@ -123,7 +123,7 @@ class SessionStore(OpenFile):
     done. Every method, and every future, raises UnavailableError or DamagedFileError where the file cannot be used.
     """
 
-    shares = False  # whether other nodes may have moved a session on
+    is_shared = False  # whether other nodes may have moved a session on
     _insert_row = INSERT_ROW
 
     def __init__(self, path: Path, db: Database, on_commit: Callable[[int], None]) -> None:
@@ -157,7 +157,7 @@ class SessionStore(OpenFile):
 
     @property
     def is_committing(self) -> bool:
-        """Whether the thread that writes is alive."""
+        """Whether the thread that commits is alive."""
         return self._commits.thread.is_alive()
 
     def create(self, record: SessionRecord) -> Future[SessionRecord]:
@@ -174,14 +174,14 @@ class SessionStore(OpenFile):
         with self._reading() as db:
             return _get(db, session_id)
 
-    def living(self) -> list[SessionRecord]:
+    def living_sessions(self) -> list[SessionRecord]:
         """Every session that has not ended, oldest first."""
         with self._reading() as db:
             rows = db.execute(f"{_SELECT} WHERE session.ended_at IS NULL ORDER BY session.number")
             return [_session(row) for row in rows]
 
-    def holders(self, *, may_have_ended: bool = False) -> list[str | None]:  # noqa: ARG002 - for who shares
-        """The API key (None: none) of every session that has not ended, perhaps of others where that is told sooner."""
+    def holders(self, *, may_have_ended: bool = False) -> list[str | None]:  # noqa: ARG002 - of shared sessions
+        """The API key (None: none) of every session that has not ended, and perhaps of some that have."""
         with self._reading() as db:
             return [key_id for (key_id,) in db.execute("SELECT key_id FROM session WHERE ended_at IS NULL")]
 
@@ -191,9 +191,9 @@ class SessionStore(OpenFile):
             return set(db.execute("SELECT DISTINCT domain, map_version FROM session WHERE ended_at IS NULL"))
 
     def newest_living(
-        self, domain: str | None, before: int | None, limit: int, at: float
+        self, domain: str | None, last_key: int | None, limit: int, time_s: float
     ) -> ListPage[ListedSession, int]:
-        """A page of the sessions that live at a moment, of a domain or all, newest first, behind number `before`.
+        """A page of the sessions that live at a moment, of a domain or all, newest first, behind number `last_key`.
 
         Counting views can take a while, so it reads through a connection of its own: no robot waits for a list.
         """
@@ -205,10 +205,10 @@ class SessionStore(OpenFile):
                   AND coalesce(latest.expires_at, session.expires_at) > ?
                 ORDER BY session.number DESC LIMIT ?
                 """,
-                [_MAX_NUMBER if before is None else before, domain, at, limit + 1],
+                [_MAX_NUMBER if last_key is None else last_key, domain, time_s, limit + 1],
             ).fetchall()
-            listed = [ListedSession(_session(row), _n_observations(db, row[0])) for row in rows]
-            return ListPage.of(((entry.session.number, entry) for entry in listed), limit)
+            entries = [ListedSession(_session(row), _n_observations(db, row[0])) for row in rows]
+            return ListPage.of(((entry.session.number, entry) for entry in entries), limit)
 
     def end(self, number: int, ending: str, ended_at: float) -> Future[bool]:
         """End a session ("deleted", "expired"); its journal stays until it is purged.
@@ -270,17 +270,17 @@ class SessionStore(OpenFile):
 
         return self._commits.submit(write, by_turns=True)
 
-    def history(self, number: int, until: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
-        """What makes up the state after a row: the snapshot, if it is from before that row, and the rows since."""
-        snapshot = self.snapshot_before(number, until)
-        return snapshot, self.journal(number, snapshot.sequence if snapshot else 0, until)
+    def history(self, number: int, last_sequence: int) -> tuple[StateSnapshot | None, list[JournalRow]]:
+        """What makes up the state after row `last_sequence`: the snapshot, if it is from before, and the rows since."""
+        snapshot = self.snapshot_before(number, last_sequence)
+        return snapshot, self.journal(number, snapshot.sequence if snapshot else 0, last_sequence)
 
-    def snapshot_before(self, number: int, until: int) -> StateSnapshot | None:
-        """A session's snapshot, if it is from before a row; raises DamagedFileError."""
+    def snapshot_before(self, number: int, sequence: int) -> StateSnapshot | None:
+        """A session's snapshot, if it is from before row `sequence`; raises DamagedFileError."""
         with self._reading() as db:
             rows = db.execute(
                 "SELECT name, sequence, dtype, shape, body FROM snapshot WHERE session = ? AND sequence < ?",
-                [number, until],
+                [number, sequence],
             ).fetchall()
         arrays = {}
         for name, _, dtype, shape, body in rows:
@@ -290,8 +290,8 @@ class SessionStore(OpenFile):
             arrays[name] = np.frombuffer(body, dtype).reshape(dimensions)
         return StateSnapshot(rows[0][1], arrays) if rows else None
 
-    def journal(self, number: int, after: int = 0, until: int = 2**62) -> list[JournalRow]:
-        """What happened to a session, in order: the rows after one, up to and with another."""
+    def journal(self, number: int, snapshot_sequence: int = 0, last_sequence: int = 2**62) -> list[JournalRow]:
+        """The rows of a session's journal in order, those behind `snapshot_sequence` up to and with `last_sequence`."""
         with self._reading() as db:
             rows = db.execute(
                 """
@@ -299,11 +299,11 @@ class SessionStore(OpenFile):
                        dissimilarities, encoding, position_m, std_m
                 FROM journal WHERE session = ? AND sequence > ? AND sequence <= ? ORDER BY sequence
                 """,
-                [number, after, until],
+                [number, snapshot_sequence, last_sequence],
             )
             return [_row(row) for row in rows]
 
-    def named(self, number: int, key: str) -> tuple[int, bytes] | None:
+    def find_observation(self, number: int, key: str) -> tuple[int, bytes] | None:
         """Sequence number and request digest of the observation with this idempotency key."""
         with self._reader_lock, storage_faults(self._path):  # one statement, on the hot path, needs no transaction
             row: tuple[int, bytes] | None = self._reader.conn.execute(
@@ -321,19 +321,19 @@ class SessionStore(OpenFile):
     ) -> Future[NDArray[np.float64] | None]:
         """Keep where the robot truly was at every observation of a session; answers with what was kept before.
 
-        A position replaces an earlier one of its observation; NaN, unknown now, leaves it.
+        A position replaces an earlier one of its observation; NaN leaves that as it is.
         """
 
         def write(db: Database) -> NDArray[np.float64] | None:
-            before, merged = _true_positions(db, number), position_m.copy()
-            if before is not None:
-                both = merged[: before.size]
-                np.copyto(both, before[: both.size], where=np.isnan(both))
+            earlier_m, merged_m = _true_positions(db, number), position_m.copy()
+            if earlier_m is not None:
+                overlap_m = merged_m[: earlier_m.size]
+                np.copyto(overlap_m, earlier_m[: overlap_m.size], where=np.isnan(overlap_m))
             db.execute(
                 "INSERT OR REPLACE INTO true_positions (session, received_at, position_m) VALUES (?, ?, ?)",
-                [number, received_at, np.ascontiguousarray(merged, "<f8").tobytes()],
+                [number, received_at, np.ascontiguousarray(merged_m, "<f8").tobytes()],
             )
-            return before
+            return earlier_m
 
         return self._commits.submit(write)
 
@@ -380,12 +380,12 @@ def columns_of(row: JournalRow, written_at: float) -> tuple[Any, ...]:
         return ("prior", written_at, row.expires_at, *[None] * 7, row.position_m, row.std_m)
     # Twice the ranks, which are whole or half numbers: 2 bytes each where they fit.
     ranks = np.rint(2.0 * row.ranks.astype(np.float64)).astype("<u2" if row.ranks.size <= _MOST_IN_TWO_BYTES else "<u4")
-    compared, encoding = row.dissimilarities, row.encoding
+    dissimilarities, encoding = row.dissimilarities, row.encoding
     return (
         *("observation", written_at, row.expires_at),
         *((row.idempotency.key, row.idempotency.digest) if row.idempotency else (None, None)),
         *(row.action_m, row.action_std_m, ranks.tobytes()),
-        None if compared is None else np.ascontiguousarray(compared, "<f4").tobytes(),
+        None if dissimilarities is None else np.ascontiguousarray(dissimilarities, "<f4").tobytes(),
         None if encoding is None else np.ascontiguousarray(encoding, "<f4").tobytes(),
         *(None, None),
     )
@@ -414,11 +414,11 @@ def _row(row: tuple[Any, ...]) -> JournalRow:
     if kind == "prior":
         return PriorRow(sequence, expires_at, position_m, std_m)
     # More than fit in two bytes each can only be half as many of four.
-    doubled = np.frombuffer(ranks, "<u2" if len(ranks) // 2 <= _MOST_IN_TWO_BYTES else "<u4")
+    doubled_ranks = np.frombuffer(ranks, "<u2" if len(ranks) // 2 <= _MOST_IN_TWO_BYTES else "<u4")
     dissimilarities, encoding = (None if view is None else np.frombuffer(view, "<f4") for view in views)
     return ObservedRow(
         *(sequence, expires_at, action_m, action_std_m),
-        np.asarray(doubled / 2, np.float32),
+        np.asarray(doubled_ranks / 2, np.float32),
         dissimilarities,
         encoding,
         None if key is None else IdempotencyKey(key, digest),

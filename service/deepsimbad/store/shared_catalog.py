@@ -21,11 +21,11 @@ from deepsimbad.store.catalog_maps import ANY, AnyVersion
 from deepsimbad.store.connection import look_at, open_database
 from deepsimbad.store.durable import empty_graves, storage_faults, sync
 from deepsimbad.store.map_store import MapCache, MapStore
-from deepsimbad.store.records import DomainRecord, MapRecord, MapState, from_json, now, read_domains, to_json
+from deepsimbad.store.records import DomainRecord, MapRecord, MapState, current_moment, from_json, read_domains, to_json
 
 T = TypeVar("T")
 _State: TypeAlias = dict[str, Any] | None
-_LEAST_BETWEEN_STATES = 256  # entries of the log; of many domains an eighth of their number
+_LEAST_BETWEEN_STATES = 256  # entries of the log; with many domains an eighth of their number
 _ADMINISTRATOR = "administrator"  # among a domain's options
 
 
@@ -36,7 +36,7 @@ def open_catalog(
 
     Args:
         map_store: URL of the store; None: the one that the data directory follows already, if any.
-        cache_bytes: Of map files that may lie in the data directory though the store has them; None: any number.
+        cache_bytes: Most bytes of map files in the data directory that the store has too; None: any number.
         administrator: Which of several that administer has the data directory, noted there; None: what it notes.
 
     Raises:
@@ -44,13 +44,13 @@ def open_catalog(
         ConflictError: The data directory follows another store.
         UnavailableError: A store that it does not follow yet cannot be reached.
     """
-    followed = followed_store(data_dir)
-    if map_store is None and followed is None:
+    followed_url = followed_store(data_dir)
+    if map_store is None and followed_url is None:
         return Catalog.open(data_dir)
-    store = MapStore.open(map_store or str(followed))
+    store = MapStore.open(map_store or str(followed_url))
     catalog = SharedCatalog.open(data_dir)
     try:
-        catalog.begin_to_follow(store, cache_bytes, administrator, is_new=store.url != followed)
+        catalog.begin_to_follow(store, cache_bytes, administrator, is_new=store.url != followed_url)
     except BaseException:
         catalog.close()
         raise
@@ -61,14 +61,14 @@ def followed_store(data_dir: Path) -> str | None:
     """The URL of the map store that a data directory follows, if any; raises DamagedFileError."""
     path = layout.catalog_path(data_dir)
 
-    def ask(db: Database) -> str | None:
+    def read_url(db: Database) -> str | None:
         rows = db.execute("SELECT url FROM map_store").fetchall() if "map_store" in db.table_names() else []
         return rows[0][0] if rows else None
 
     if not path.exists():
         return None
     with storage_faults(path):
-        return look_at(path, ask)
+        return look_at(path, read_url)
 
 
 def inspect_objects(data_dir: Path, on_progress: Callable[[float], None]) -> Inspection:
@@ -76,9 +76,9 @@ def inspect_objects(data_dir: Path, on_progress: Callable[[float], None]) -> Ins
     url, path = followed_store(data_dir), layout.catalog_path(data_dir)
     if url is None:
         raise NotFoundError(f"{data_dir} follows no map store: there are no objects to check")
-    ask = "SELECT DISTINCT sha256 FROM map WHERE shared AND removed_at IS NULL ORDER BY sha256"
+    query = "SELECT DISTINCT sha256 FROM map WHERE shared AND removed_at IS NULL ORDER BY sha256"
     with storage_faults(path):
-        digests = [digest for (digest,) in look_at(path, lambda db: db.execute(ask).fetchall())]
+        digests = [digest for (digest,) in look_at(path, lambda db: db.execute(query).fetchall())]
     return Inspection(len(digests), tuple(MapStore.open(url).inspect(digests, on_progress)))
 
 
@@ -100,7 +100,7 @@ class SharedCatalog(Catalog):
 
     def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(data_dir, db)
-        self.following = threading.Lock()  # held by who follows and does what follows from it
+        self.follow_lock = threading.Lock()  # held by a caller of `follow` until the changes are served
         self._transaction: Database | None = None
         self._is_trying = False
 
@@ -122,8 +122,8 @@ class SharedCatalog(Catalog):
     def _note_store(self, store: MapStore) -> None:
         store_id = store.store_id()
         with self._writing() as db:
-            for url, present in db.execute("SELECT url, store_id FROM map_store").fetchall():
-                if present != store_id:
+            for url, followed_id in db.execute("SELECT url, store_id FROM map_store").fetchall():
+                if followed_id != store_id:
                     raise ConflictError(
                         f"{self.data_dir} follows the map store {url}: export its maps and import them into a new data "
                         f"directory to publish them to {store.url}",
@@ -142,10 +142,10 @@ class SharedCatalog(Catalog):
             DomainDiffersError: A domain that was published has the name of another that was made here.
             DamagedFileError, UnavailableError: As `MapStore`.
         """
-        changed = self._begin_with_state() if self._position() == 0 else []
+        changed_domains = self._begin_with_state() if self._position() == 0 else []
         for number, entry in self.store.entries(self._position()):
-            changed += self._apply(number, entry)
-        return changed
+            changed_domains += self._apply(number, entry)
+        return changed_domains
 
     def _position(self) -> int:
         with self._reading() as db:
@@ -156,8 +156,8 @@ class SharedCatalog(Catalog):
         if state is None:
             return []
         with self._writing() as db:
-            for name, of_domain in state["domains"].items():
-                self._take_over(db, name, of_domain)
+            for name, domain_state in state["domains"].items():
+                self._take_over(db, name, domain_state)
             db.execute("UPDATE map_store SET position = ?", [state["position"]])
         sync(layout.domains_folder(self.data_dir))
         return list(state["domains"])
@@ -180,9 +180,9 @@ class SharedCatalog(Catalog):
 
     def _take_over(self, db: Database, name: str, state: Mapping[str, Any]) -> None:
         """Let a domain be what the log says; raises DomainDiffersError where another of its name was made here."""
-        about = {key: state[key] for key in ("evaluator", "closed", "actions_m")}
+        configuration = {key: state[key] for key in ("evaluator", "closed", "actions_m")}
         for record in read_domains(db, name):
-            if to_json(record.configuration) != to_json(about):
+            if to_json(record.configuration) != to_json(configuration):
                 raise DomainDiffersError(
                     f"domain {name} of {self.data_dir} has another configuration than that of the map store: delete "
                     "one of the two first",
@@ -202,14 +202,14 @@ class SharedCatalog(Catalog):
         )
         layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
         layout.maps_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)
-        for earlier in state.get("earlier_maps", ()):  # sessions may live on them, and be rolled back to
-            self._take_over_map(db, name, **earlier)
+        for earlier_map in state.get("earlier_maps", ()):  # sessions may live on them, and be rolled back to
+            self._take_over_map(db, name, **earlier_map)
             db.execute(
                 """
                 UPDATE map SET state = 'retired', retired_at = ?
                 WHERE domain = ? AND version = ? AND state = 'sealed'
                 """,
-                [now(), name, earlier["version"]],
+                [current_moment(), name, earlier_map["version"]],
             )
         if state["map"] is not None:
             self._take_over_map(db, name, **state["map"])
@@ -226,21 +226,23 @@ class SharedCatalog(Catalog):
         config: Mapping[str, Any],
         metrics: Mapping[str, Any],
     ) -> None:
-        """Note a version of the store's; one of its number that was made here meanwhile gets the next free number."""
-        where = [name, version]
-        mine = db.execute("SELECT sha256, state FROM map WHERE domain = ? AND version = ?", where).fetchone()
+        """Note a version of the store's; one of the same number that was made here meanwhile is renumbered."""
+        key = [name, version]
+        own_row = db.execute("SELECT sha256, state FROM map WHERE domain = ? AND version = ?", key).fetchone()
         db.execute("UPDATE domain SET next_version = max(next_version, ?) WHERE name = ?", [version + 1, name])
-        if mine is not None and mine[0] != sha256 and mine[1] == MapState.BUILDING:
-            db.execute("DELETE FROM map WHERE domain = ? AND version = ?", where)  # who builds it is told at the end
-        elif mine is not None and mine[0] != sha256:
-            (free,) = db.execute("SELECT next_version FROM domain WHERE name = ?", [name]).fetchone()
-            other = self.map_path(name, free)
-            other.unlink(missing_ok=True)
+        if own_row is not None and own_row[0] != sha256 and own_row[1] == MapState.BUILDING:
+            db.execute("DELETE FROM map WHERE domain = ? AND version = ?", key)  # who builds it is told at the end
+        elif own_row is not None and own_row[0] != sha256:
+            (free_version,) = db.execute("SELECT next_version FROM domain WHERE name = ?", [name]).fetchone()
+            moved_path = self.map_path(name, free_version)
+            moved_path.unlink(missing_ok=True)
             with suppress(FileNotFoundError):  # damaged before: what it was called makes no difference
-                os.link(self.map_path(name, version), other)
-            state = MapState.RETIRED if mine[1] == MapState.ACTIVE else mine[1]
-            db.execute("UPDATE map SET version = ?, state = ? WHERE domain = ? AND version = ?", [free, state, *where])
-            db.execute("UPDATE domain SET next_version = ? WHERE name = ?", [free + 1, name])
+                os.link(self.map_path(name, version), moved_path)
+            state = MapState.RETIRED if own_row[1] == MapState.ACTIVE else own_row[1]
+            db.execute(
+                "UPDATE map SET version = ?, state = ? WHERE domain = ? AND version = ?", [free_version, state, *key]
+            )
+            db.execute("UPDATE domain SET next_version = ? WHERE name = ?", [free_version + 1, name])
         db.execute(
             """
             INSERT INTO map (domain, version, state, created_at, sha256, file_bytes, config, metrics, shared)
@@ -289,7 +291,7 @@ class SharedCatalog(Catalog):
         return self.domain(name), is_new
 
     def _keep_administrator(self, name: str) -> None:
-        """Within a change: say of a domain that it was made here; of the first that administers nothing is said."""
+        """Within a change: note with a domain which administrator made it, unless that is the first."""
         if self.administrator > 0:
             super().set_options(name, {_ADMINISTRATOR: self.administrator})
 
@@ -304,7 +306,7 @@ class SharedCatalog(Catalog):
         return self.domain(name)
 
     def delete_domain(self, name: str, *, only_empty: bool = False) -> None:
-        """As `Catalog.delete_domain`; the domain is no more anywhere."""
+        """As `Catalog.delete_domain`, on every node."""
         delete = super().delete_domain
         with self._reading() as db:
             is_shared = _is_shared_domain(db, name)
@@ -314,7 +316,7 @@ class SharedCatalog(Catalog):
             delete(name, only_empty=only_empty)
 
     def activate(self, domain: str, version: int, expected: int | AnyVersion | None) -> MapRecord:
-        """As `Catalog.activate`, everywhere; LostActivationError too where another node published the number first."""
+        """As `Catalog.activate`, on every node; LostActivationError too where another published the number first."""
         swap, digest = super().activate, self.map_anywhere(domain, version).sha256
 
         def change() -> None:
@@ -330,35 +332,39 @@ class SharedCatalog(Catalog):
         return self.map(domain, version)
 
     def _publish(self, name: str, change: Callable[[], T]) -> T:
-        """Make a change of a domain everywhere, unless it changes nothing; answers what the change did when tried."""
+        """Make a change of a domain on every node, unless nothing changes; answers what `change` did when tried."""
         while True:
             self.follow()
-            before, after, position, answer = self._tried(name, change)
-            if before == after:
+            old_state, new_state, position, answer = self._try_change(name, change)
+            if old_state == new_state:
                 return answer
-            if after is not None and after["map"] is not None and (before is None or before["map"] != after["map"]):
-                map_ = after["map"]
+            if (
+                new_state is not None
+                and new_state["map"] is not None
+                and (old_state is None or old_state["map"] != new_state["map"])
+            ):
+                map_ = new_state["map"]
                 self.store.put_map(self.map_path(name, map_["version"]), map_["sha256"], map_["file_bytes"])
-            entry = {"domain": name, "state": after, "at": now()}
+            entry = {"domain": name, "state": new_state, "at": current_moment()}
             if self.store.append(position + 1, entry):
                 break
         self._apply(position + 1, entry)
         self._write_state(position + 1)
         return answer
 
-    def _tried(self, name: str, change: Callable[[], T]) -> tuple[_State, _State, int, T]:
-        """What a domain is in the log and would be after a change, the log's last number, what the change answered."""
+    def _try_change(self, name: str, change: Callable[[], T]) -> tuple[_State, _State, int, T]:
+        """A domain's state in the log and after a change, the log's last number, what `change` answered; all undone."""
         with suppress(_UndoneError), self._writing() as db:
-            before = _state_of(db, name) if _is_shared_domain(db, name) else None
+            old_state = _state_of(db, name) if _is_shared_domain(db, name) else None
             position = int(db.execute("SELECT position FROM map_store").fetchone()[0])
             self._is_trying = True
             try:
                 answer = change()
             finally:
                 self._is_trying = False
-            tried = before, _state_of(db, name), position, answer
+            outcome = old_state, _state_of(db, name), position, answer
             raise _UndoneError
-        return tried
+        return outcome
 
     @contextmanager
     def _writing(self) -> Iterator[Database]:
@@ -379,13 +385,13 @@ class SharedCatalog(Catalog):
             super()._finish_deletion(db, name)
 
     def _write_state(self, position: int) -> None:
-        """Write all domains as one object, so seldom that it costs little an entry."""
-        path, between = layout.catalog_path(self.data_dir), _LEAST_BETWEEN_STATES
+        """Write all domains as one object now and then, so that it costs little an entry."""
+        path, interval = layout.catalog_path(self.data_dir), _LEAST_BETWEEN_STATES
         with open_database(path, read_only=True) as db, db.atomic():  # robots' answers need the other connections
             names = [name for (name,) in db.execute("SELECT name FROM domain WHERE shared")]
-            while between < len(names) // 8:
-                between *= 2
-            if position % between:
+            while interval < len(names) // 8:
+                interval *= 2
+            if position % interval:
                 return
             (position,) = db.execute("SELECT position FROM map_store").fetchone()
             states = {
@@ -399,7 +405,7 @@ class SharedCatalog(Catalog):
     def map_file(self, domain: str, version: int) -> Path:
         """As `Catalog.map_file`; a shared map that is missing or damaged here is fetched, once however many ask."""
         record, path = self.map(domain, version), self.map_path(domain, version)
-        with self._cache.asked_for(path):
+        with self._cache.fetch_lock(path):
             try:
                 super().map_file(domain, version)
             except DamagedMapError:
@@ -437,7 +443,7 @@ def _is_shared_domain(db: Database, name: str) -> bool:
 
 
 def _state_of(db: Database, name: str) -> _State:
-    """What the log says of a domain, None where there is none."""
+    """A domain as the log holds it; None where there is none."""
     for record in read_domains(db, name):
         return {
             **record.configuration,
@@ -449,7 +455,7 @@ def _state_of(db: Database, name: str) -> _State:
 
 
 def _maps(db: Database, name: str, state: str) -> list[dict[str, Any]]:
-    """What the log says of a domain's versions, those that serve, or that served and may again."""
+    """A domain's versions in a state as the log holds them: the active one, or shared ones that have their files."""
     rows = db.query(
         """
         SELECT version, created_at, sha256, file_bytes, config, metrics FROM map

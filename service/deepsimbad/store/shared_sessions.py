@@ -41,11 +41,11 @@ from deepsimbad.store.sessions import (
 
 _ID = re.compile(r"[0-9a-f]{32}")
 _CREATED_AT = 5  # among the columns of a session
-_AT_ONCE = 16  # objects written, and as many read
+_N_THREADS = 16  # objects written, and as many read
 _MANY_ROWS = 16  # from so many on a snapshot is looked for
 _NO_KEY = "-"
-_KEPT_S = 60.0  # that a list of who lives stands, to which those are added that began since
-_LATE_S = 60.0  # by which clocks may differ, or a mark be written after its session's beginning
+_LISTING_AGE_S = 60.0  # most of a list of living sessions, to which those are added that began since
+_LATE_S = 60.0  # by which clocks may differ, or a mark be written after its session began
 
 
 @dataclass(frozen=True)
@@ -60,20 +60,20 @@ class Mark:
 
     @classmethod
     def of(cls, record: SessionRecord) -> Self:
-        """A session's."""
+        """The mark of a session."""
         return cls(record.domain, record.map_version, record.key_id, record.number, record.session_id)
 
     @classmethod
     def parse(cls, name: str) -> Self:
-        """The one that an object's name is."""
+        """Read the mark that an object's name is."""
         _, number, session_id, domain, version, key_id = name.split("/")
         return cls(domain, int(version), None if key_id == _NO_KEY else key_id, int(number), session_id)
 
     @property
     def name(self) -> str:
-        """Of its object."""
-        whose = f"{self.domain}/{self.map_version}/{self.key_id or _NO_KEY}"
-        return f"living/{_digits(self.number)}/{self.session_id}/{whose}"
+        """The name of its object."""
+        owner = f"{self.domain}/{self.map_version}/{self.key_id or _NO_KEY}"
+        return f"living/{_digits(self.number)}/{self.session_id}/{owner}"
 
 
 class SharedSessionStore(SessionStore):
@@ -82,16 +82,16 @@ class SharedSessionStore(SessionStore):
     What it writes raises SessionMovedError where another node has moved the session on.
     """
 
-    shares = True
+    is_shared = True
     _insert_row = INSERT_ROW.replace("INSERT", "INSERT OR IGNORE", 1)  # who looked meanwhile has copied it already
     _objects: Objects
     _is_own: Callable[[str], bool]
     _writers: ThreadPoolExecutor
     _readers: ThreadPoolExecutor
-    _listed: tuple[float, dict[str, Mark]]  # when all who live were, and by the names of their objects
+    _listing: tuple[float, dict[str, Mark]]  # when all living sessions were listed, and their marks by object name
 
     @classmethod
-    def sharing(
+    def open_shared(
         cls,
         objects: Objects,
         data_dir: Path,
@@ -101,16 +101,16 @@ class SharedSessionStore(SessionStore):
         """Open a node's own file; its sessions are read from the objects as they are asked for.
 
         Args:
-            objects: Where they are shared.
-            data_dir: Of the file.
+            objects: Where sessions are shared.
+            data_dir: Where the node's own file lies.
             on_commit: As `SessionStore.open`.
-            is_own: Whether this node is the one that looks after a session, by its id: that it expires, say.
+            is_own: Whether this node is the one that looks after a session, by its id: lets it expire, say.
         """
         store = cls.open(data_dir, on_commit)
-        store._objects, store._is_own, store._listed = objects, is_own, (-math.inf, {})
+        store._objects, store._is_own, store._listing = objects, is_own, (-math.inf, {})
         store._db.execute("PRAGMA synchronous = OFF")  # the objects are what has to survive
-        store._writers = ThreadPoolExecutor(_AT_ONCE, "shared journal")
-        store._readers = ThreadPoolExecutor(_AT_ONCE, "shared journal, read")
+        store._writers = ThreadPoolExecutor(_N_THREADS, "shared journal")
+        store._readers = ThreadPoolExecutor(_N_THREADS, "shared journal, read")
         return store
 
     def close(self) -> None:
@@ -119,48 +119,48 @@ class SharedSessionStore(SessionStore):
         self._readers.shutdown()
         super().close()
 
-    # Who lives
+    # Living sessions
 
     def marks(self) -> list[Mark]:
-        """Of all sessions that live anywhere; a request a thousand."""
-        began, marks = time.time(), self._list()
-        self._listed = began, marks
+        """The marks of all sessions that live on any node; one request a thousand."""
+        listed_at, marks = time.time(), self._list()
+        self._listing = listed_at, marks
         return list(marks.values())
 
-    def _list(self, after: str | None = None) -> dict[str, Mark]:
-        return {name: Mark.parse(name) for name in self._objects.names("living/", after)}
+    def _list(self, previous_name: str | None = None) -> dict[str, Mark]:
+        return {name: Mark.parse(name) for name in self._objects.names("living/", previous_name)}
 
     def holders(self, *, may_have_ended: bool = False) -> list[str | None]:
         """As where nothing is shared, of all nodes.
 
         Args:
-            may_have_ended: Whether some may be among them that lived when all were listed, a minute ago at most: then
-                only who began since is asked for, which is a request however many live.
+            may_have_ended: Whether sessions that have ended since all were listed, a minute ago at most, may count:
+                then only those that began since are asked for, which is one request however many live.
         """
-        listed_at, marks = self._listed
-        if not may_have_ended or time.time() - listed_at > _KEPT_S:
+        listed_at, marks = self._listing
+        if not may_have_ended or time.time() - listed_at > _LISTING_AGE_S:
             return [mark.key_id for mark in self.marks()]
-        begun = self._list(f"living/{_digits(_number_at(listed_at - _LATE_S))}")
-        return [mark.key_id for mark in (marks | begun).values()]
+        new_marks = self._list(f"living/{_digits(_number_at(listed_at - _LATE_S))}")
+        return [mark.key_id for mark in (marks | new_marks).values()]
 
     def pins(self) -> set[tuple[str, int]]:
         """As where nothing is shared, of all nodes."""
         return {(mark.domain, mark.map_version) for mark in self.marks()}
 
-    def living(self) -> list[SessionRecord]:
-        """As where nothing is shared, and those of which this node is the one that looks after them, as they began."""
+    def living_sessions(self) -> list[SessionRecord]:
+        """Those in the file, and as they began those in the objects that this node looks after."""
         names = [_name(mark.session_id, 0) for mark in self.marks() if self._is_own(mark.session_id)]
-        begun = [_unpacked(body) for body in self._readers.map(self._objects.get, names) if body is not None]
+        sessions = [_unpack(body) for body in self._readers.map(self._objects.get, names) if body is not None]
 
         def write(db: Database) -> None:
-            for columns in begun:
+            for columns in sessions:
                 _insert_session(db, columns)
 
         self._commits.submit(write).result()
-        return super().living()
+        return super().living_sessions()
 
-    def listed(self, session_ids: Sequence[str]) -> list[ListedSession]:
-        """Sessions as they are by now, to be told in a list; what is unknown is left out."""
+    def listed_sessions(self, session_ids: Sequence[str]) -> list[ListedSession]:
+        """Sessions as they are now, for a list; unknown ids are left out."""
 
         def look(session_id: str) -> list[ListedSession]:
             try:
@@ -169,8 +169,8 @@ class SharedSessionStore(SessionStore):
                 return []
             return [ListedSession(record, self.n_observations(record.number))]
 
-        with ThreadPoolExecutor(_AT_ONCE) as looks:
-            return [entry for entries in looks.map(look, session_ids) for entry in entries]
+        with ThreadPoolExecutor(_N_THREADS) as readers:
+            return [entry for entries in readers.map(look, session_ids) for entry in entries]
 
     # One session
 
@@ -179,7 +179,7 @@ class SharedSessionStore(SessionStore):
 
         def write() -> SessionRecord:
             columns = session_columns(record)
-            if self._objects.create(_name(record.session_id, 0), _packed(columns)):
+            if self._objects.create(_name(record.session_id, 0), _pack(columns)):
                 self._copy(record.session_id, -1, [columns])
             else:
                 self._pull(record.session_id, -1)
@@ -212,7 +212,7 @@ class SharedSessionStore(SessionStore):
             self._create(session_id, row.sequence, columns_of(row, written_at))
             SessionStore.append(self, number, row, written_at, snapshot).result()
             if snapshot is not None:
-                body = _packed(snapshot_columns(snapshot))
+                body = _pack(snapshot_columns(snapshot))
                 with suppress(RuntimeError):  # nobody waits for it, nor does the end of the node
                     self._writers.submit(self._objects.put, _snapshot_name(session_id), body)
 
@@ -235,17 +235,17 @@ class SharedSessionStore(SessionStore):
     def save_true_positions(
         self, number: int, position_m: NDArray[np.float64], received_at: float
     ) -> Future[NDArray[np.float64] | None]:
-        """As where nothing is shared; of two that are told of one session at once, by two nodes, one may be lost."""
+        """As where nothing is shared; where two nodes save for one session at once, one answer may be lost."""
 
         def write() -> NDArray[np.float64] | None:
             save, name = super(SharedSessionStore, self).save_true_positions, f"truths/{self._id(number)}"
-            if (shared := self._objects.get(name)) is not None:
-                save(number, np.frombuffer(shared, "<f8"), received_at).result()
-            before = save(number, position_m, received_at).result()
-            merged = self.true_positions(number)
-            assert merged is not None
-            self._objects.put(name, merged.tobytes())
-            return before
+            if (shared_body := self._objects.get(name)) is not None:
+                save(number, np.frombuffer(shared_body, "<f8"), received_at).result()
+            earlier_m = save(number, position_m, received_at).result()
+            merged_m = self.true_positions(number)
+            assert merged_m is not None
+            self._objects.put(name, merged_m.tobytes())
+            return earlier_m
 
         return self._writers.submit(write)
 
@@ -255,33 +255,33 @@ class SharedSessionStore(SessionStore):
             return str(session_id)
 
     def _create(self, session_id: str, sequence: int, columns: Any) -> None:
-        if not self._objects.create(_name(session_id, sequence), _packed(columns)):
+        if not self._objects.create(_name(session_id, sequence), _pack(columns)):
             raise SessionMovedError(
                 f"session {session_id} was moved on elsewhere this moment: try again", retry_after_s=1
             )
 
     def _unmark(self, record: SessionRecord) -> None:
-        """It has ended: nothing but its journal is needed any more."""
+        """Delete all objects of a session that has ended but its journal."""
         self._objects.delete(Mark.of(record).name)
         self._objects.delete(_snapshot_name(record.session_id))
 
     # Copies
 
-    def _pull(self, session_id: str, after: int) -> None:
-        """Copy the objects of a session that follow one into the file."""
+    def _pull(self, session_id: str, last_sequence: int) -> None:
+        """Copy the objects of a session behind number `last_sequence` into the file."""
         # One that is missing is quicker to ask for than a list, and is what is answered nearly always.
-        if (next_one := self._objects.get(_name(session_id, after + 1))) is None:
+        if (next_body := self._objects.get(_name(session_id, last_sequence + 1))) is None:
             return
-        names = sorted(self._objects.names(f"sessions/{session_id}/", _name(session_id, after + 1)))
-        bodies = [next_one, *(body for body in self._readers.map(self._objects.get, names) if body is not None)]
-        self._copy(session_id, after, [_unpacked(body) for body in bodies])
+        names = sorted(self._objects.names(f"sessions/{session_id}/", _name(session_id, last_sequence + 1)))
+        bodies = [next_body, *(body for body in self._readers.map(self._objects.get, names) if body is not None)]
+        self._copy(session_id, last_sequence, [_unpack(body) for body in bodies])
 
-    def _copy(self, session_id: str, after: int, rows: Sequence[Sequence[Any]]) -> None:
-        """Write what follows an object of a session into the file, and see to it that what says it lives is true."""
+    def _copy(self, session_id: str, last_sequence: int, rows: Sequence[Sequence[Any]]) -> None:
+        """Write a session's rows behind number `last_sequence` into the file; mark it, or unmark it where it ended."""
         snapshot = self._objects.get(_snapshot_name(session_id)) if len(rows) > _MANY_ROWS else None
 
         def write(db: Database) -> None:
-            for sequence, columns in enumerate(rows, after + 1):
+            for sequence, columns in enumerate(rows, last_sequence + 1):
                 if sequence == 0:
                     _insert_session(db, columns)
                     continue
@@ -292,13 +292,13 @@ class SharedSessionStore(SessionStore):
                 else:
                     db.conn.execute(self._insert_row, (number, sequence, *columns))
             if snapshot is not None:
-                replace_snapshot(db, number, _unpacked(snapshot))
+                replace_snapshot(db, number, _unpack(snapshot))
 
         self._commits.submit(write).result()
         record = super().find(session_id)
         if record.ending is not None:
             self._unmark(record)
-        elif after < 0:  # who wrote it may have ended before it was marked
+        elif last_sequence < 0:  # the node that created it may have stopped before it was marked
             self._objects.put(Mark.of(record).name, b"")
 
 
@@ -309,12 +309,12 @@ def _insert_session(db: Database, columns: Sequence[Any]) -> None:
 
 
 def _number_at(created_at: float) -> int:
-    """The least of a session that begins then."""
+    """The least number of a session that begins at `created_at` (seconds since 1970)."""
     return 1000 * int(1e5 * created_at)
 
 
 def _digits(number: int) -> str:
-    """In the order of names as of numbers."""
+    """A number as text of one length, so that texts sort as numbers do."""
     return f"{number:019d}"
 
 
@@ -326,11 +326,11 @@ def _snapshot_name(session_id: str) -> str:
     return f"snapshots/{session_id}"
 
 
-def _packed(columns: Any) -> bytes:
-    """What the file would hold, as JSON; blobs in base 64."""
+def _pack(columns: Any) -> bytes:
+    """Columns of the file as JSON, blobs in base 64."""
     return json.dumps(columns, default=lambda blob: {"blob": base64.b64encode(blob).decode()}).encode()
 
 
-def _unpacked(body: bytes) -> list[Any]:
-    columns: list[Any] = json.loads(body, object_hook=lambda held: base64.b64decode(held["blob"]))
+def _unpack(body: bytes) -> list[Any]:
+    columns: list[Any] = json.loads(body, object_hook=lambda blob: base64.b64decode(blob["blob"]))
     return columns

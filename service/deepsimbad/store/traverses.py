@@ -43,8 +43,8 @@ from deepsimbad.store.connection import (
     write_transaction,
 )
 from deepsimbad.store.durable import lock_folder, remove_database, storage_faults, sync
-from deepsimbad.store.pictures import Spool, clear_spool, spool_pictures, spooled
-from deepsimbad.store.records import now, to_json
+from deepsimbad.store.pictures import Spool, clear_spool, spool_pictures, spool_size
+from deepsimbad.store.records import current_moment, to_json
 from deepsimbad_migrations.traverse.migrations import migrations
 
 _ROWS_AT_ONCE = 1024
@@ -61,7 +61,7 @@ class TraverseSummary:
     missing: list[tuple[int, int]]  # ranges [first, last] of indices below the greatest that have no frame
     length_m: float | None  # from the least position to the greatest; None before the first frame
     span_us: tuple[int, int] | None  # the first and the last known time of a frame
-    digest: str | None  # SHA-256 in hex of all that its frames are known by; None: none are there, or one is unknown
+    digest: str | None  # SHA-256 in hex of `Traverse.identities`; None: no frames, or one of unknown content
     n_uninformative: int  # frames whose pictures show nothing, or are so unlike all others that they seem to
     n_spooled: int  # pictures that wait to be fitted
     spooled_bytes: int
@@ -94,14 +94,14 @@ class Traverse(Spool):
         with storage_faults(path), _locked_folder(path.parent, domain):
             if path.exists():
                 raise ConflictError(f"domain {domain} has a traverse {name}: delete it first, or choose another name")
-            new = path.with_suffix(".new")
-            remove_database(new)
+            new_path = path.with_suffix(".new")
+            remove_database(new_path)
             remove_database(path)  # a log that outlived its file would be replayed into the new one
-            with open_database(new, create=True) as db, db.atomic():
+            with open_database(new_path, create=True) as db, db.atomic():
                 migrations.apply(db)
-                db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [now()])
-            sync(new)
-            new.rename(path)
+                db.execute("INSERT INTO traverse (id, created_at) VALUES (1, ?)", [current_moment()])
+            sync(new_path)
+            new_path.rename(path)
             sync(path.parent)
         return cls.open(data_dir, domain, name)
 
@@ -123,14 +123,14 @@ class Traverse(Spool):
     def delete(cls, data_dir: Path, domain: str, name: str) -> None:
         """Delete a traverse; a put going on ends first, later ones are refused. Raises UnknownTraverseError."""
         path = layout.traverse_path(data_dir, domain, name)
-        with storage_faults(path), ExitStack() as until_gone:
+        with storage_faults(path), ExitStack() as stack:
             if path.parent.is_dir():
-                until_gone.enter_context(_locked_folder(path.parent, domain))
+                stack.enter_context(_locked_folder(path.parent, domain))
             if not path.is_file():
                 raise _unknown(data_dir, domain, name)
             try:
-                db = until_gone.enter_context(open_database(path))
-                until_gone.enter_context(write_transaction(db))
+                db = stack.enter_context(open_database(path))
+                stack.enter_context(write_transaction(db))
             except Exception as error:
                 if getattr(error, "sqlite_errorname", "") == "SQLITE_BUSY":
                     raise
@@ -156,7 +156,7 @@ class Traverse(Spool):
                 raise _unknown(data_dir, domain, name)
             return _main_camera(data_dir, domain, name, file_state(path))
 
-    def _gone(self) -> UnknownTraverseError:
+    def _removal_error(self) -> UnknownTraverseError:
         return UnknownTraverseError(f"traverse {self.name} was deleted")
 
     def put_frames(
@@ -165,8 +165,8 @@ class Traverse(Spool):
         """Store a batch in one transaction; never holds a second copy of it.
 
         Args:
-            replace: Whether they take the place of those of the same index; else equal ones are passed over.
-            pictures: As they were sent, by index, of those frames whose pictures shall wait in the spool.
+            replace: Whether they replace stored frames of the same index; else equal ones are passed over.
+            pictures: The pictures that shall wait in the spool, as they were sent, by frame index.
 
         Returns:
             (n_new, n_replaced).
@@ -186,11 +186,11 @@ class Traverse(Spool):
         if frames.n_frames == 0:
             return 0, 0
         with self._writing() as db:
-            rows = np.arange(frames.n_frames)  # that are written
+            rows = np.arange(frames.n_frames)  # of the frames that are written
             if not replace:
                 rows = rows[~np.isin(frames.index, self._equal(db, frames))]
             n_before, dim = _count(db), frames.encodings.shape[1]
-            present_dim, weights_sha256 = self._described(db)
+            present_dim, weights_sha256 = self._description(db)
             if present_dim not in {None, dim}:
                 raise InvalidEncodingError(
                     f"encodings of this traverse hold {present_dim} numbers, these {dim}", encoding_dim=present_dim
@@ -202,10 +202,11 @@ class Traverse(Spool):
             )
             if frames.grey_levels is not None:
                 _keep_levels(db, frames.grey_levels)
-                if (kept := _levels(db)) != frames.grey_levels:
+                if (levels := _levels(db)) != frames.grey_levels:
                     raise GreyLevelsDifferError(
-                        f"pictures of this traverse are shown by the grey levels {kept}, these by {frames.grey_levels}",
-                        grey_levels=kept,
+                        f"pictures of this traverse are shown by the grey levels {levels}, these by "
+                        f"{frames.grey_levels}",
+                        grey_levels=levels,
                     )
             columns = (
                 *(frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m, frames.frame_name),
@@ -215,7 +216,7 @@ class Traverse(Spool):
             indices = frames.index[rows].tolist()
             clear_spool(db, indices, frames.content_digest.view(np.int64)[rows].tolist())
             camera = frames.camera
-            taken_by = (None,) * 3 if camera is None else (camera.name, camera.width, camera.height)
+            camera_columns = (None,) * 3 if camera is None else (camera.name, camera.width, camera.height)
             db.conn.executemany(  # NaN becomes NULL
                 """
                 INSERT INTO frame (frame_index, position_m, timestamp_us, x_m, y_m, name, content_digest, shows_nothing,
@@ -229,7 +230,7 @@ class Traverse(Spool):
                 """,
                 zip(
                     *(map(values.item, rows) for values in columns),
-                    *(repeat(value, rows.size) for value in taken_by),
+                    *(repeat(value, rows.size) for value in camera_columns),
                     strict=True,
                 ),
             )
@@ -238,32 +239,32 @@ class Traverse(Spool):
                 INSERT INTO encoding (frame_index, body) VALUES (?, ?)
                 ON CONFLICT (frame_index) DO UPDATE SET body = excluded.body
                 """,
-                ((int(frames.index[row]), _packed(frames.encodings[row])) for row in rows),
+                ((int(frames.index[row]), _pack(frames.encodings[row])) for row in rows),
             )
             spool_pictures(db, indices, pictures)
             n_new = _count(db) - n_before
         return n_new, rows.size - n_new
 
     def _equal(self, db: Database, frames: Drive) -> NDArray[np.int64]:
-        """The indices of those frames that are there already; raises FramesDifferError where one is another."""
-        stored = _known(db, frames.index)
-        there, at, _ = np.intersect1d(frames.index, stored["index"], return_indices=True)
-        differ = differences({name: getattr(frames, name)[at] for name in IDENTITY}, stored)
-        if differ:
-            indices = there[np.any(list(differ.values()), axis=0)].tolist()
+        """The indices of those frames that are stored already; raises FramesDifferError where one differs."""
+        stored = _identities(db, frames.index)
+        common_indices, rows, _ = np.intersect1d(frames.index, stored["index"], return_indices=True)
+        differing = differences({name: getattr(frames, name)[rows] for name in IDENTITY}, stored)
+        if differing:
+            indices = common_indices[np.any(list(differing.values()), axis=0)].tolist()
             raise FramesDifferError(
                 f"{len(indices)} frames of traverse {self.name} are there already and differ in "
-                f"{', '.join(differ)}, the first of index {indices[0]}: nothing was stored. Have them "
+                f"{', '.join(differing)}, the first of index {indices[0]}: nothing was stored. Have them "
                 "replaced, or choose another traverse",
                 n_differing=len(indices),
                 indices=indices[:_NAMED_INDICES],
             )
-        return there
+        return common_indices
 
-    def known(self) -> dict[str, NDArray[Any]]:
+    def identities(self) -> dict[str, NDArray[Any]]:
         """`index` and the arrays of `core.frames.IDENTITY` of all frames, in index order; reads no encodings."""
         with self._reading() as db:
-            return _known(db)
+            return _identities(db)
 
     @property
     def n_frames(self) -> int:
@@ -275,7 +276,7 @@ class Traverse(Spool):
     def encoding_dim(self) -> int | None:
         """The length of the encodings; None before the first frame."""
         with self._reading() as db:
-            return self._described(db)[0]
+            return self._description(db)[0]
 
     def summary(self) -> "TraverseSummary":
         """What has arrived, of one moment; reads the encodings where the file was written to since it last did."""
@@ -292,25 +293,27 @@ class Traverse(Spool):
                 """
             ).fetchall()
             cameras = _cameras(db)
-            unlike = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
-            whys = [f"some of its pictures are not like the others: {why}" for why in unlike if why is not None][:1]
-            for n_such, why in ((n_blank, SHOWS_NOTHING), (n_unlike_all, UNLIKE_ALL)):
-                if n_such:
-                    whys.append(f"{n_such} of {n_frames} pictures {why}")
-            n_spooled, spooled_bytes = spooled(db)
+            reasons = (camera.unlike(cameras[:1], "most") for camera in cameras[1:])
+            warnings = [
+                f"some of its pictures are not like the others: {reason}" for reason in reasons if reason is not None
+            ][:1]
+            for n_pictures, reason in ((n_blank, SHOWS_NOTHING), (n_unlike_all, UNLIKE_ALL)):
+                if n_pictures:
+                    warnings.append(f"{n_pictures} of {n_frames} pictures {reason}")
+            n_spooled, spooled_bytes = spool_size(db)
             return TraverseSummary(
                 name=self.name,
                 n_frames=n_frames,
                 missing=missing,
                 length_m=length_m,
                 span_us=None if span_us[0] is None else (span_us[0], span_us[1]),
-                digest=_digest(_known(db)),
+                digest=_digest(_identities(db)),
                 n_uninformative=n_blank + n_unlike_all,
                 n_spooled=n_spooled,
                 spooled_bytes=spooled_bytes,
                 grey_levels=_levels(db),
                 cameras=cameras,
-                warnings=tuple(whys),
+                warnings=tuple(warnings),
             )
 
     @property
@@ -328,10 +331,10 @@ class Traverse(Spool):
     def read(self) -> Drive:
         """All frames in index order; one array of encodings, no copy beside it."""
         with self._reading() as db:
-            n, (dim, weights_sha256), cameras = _count(db), self._described(db), _cameras(db)
-            levels, places = _levels(db), np.empty((n, 3))
-            index, timestamp_us, blank = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.bool_)
-            encodings = np.empty((n, dim or 0), np.float32)
+            n_frames, (dim, weights_sha256), cameras = _count(db), self._description(db), _cameras(db)
+            levels, places = _levels(db), np.empty((n_frames, 3))
+            indices, timestamp_us = np.empty(n_frames, np.int64), np.empty(n_frames, np.int64)
+            encodings, is_blank = np.empty((n_frames, dim or 0), np.float32), np.empty(n_frames, np.bool_)
             names: list[str] = []  # the class has a `list` of its own
             rows = db.execute(
                 """
@@ -344,17 +347,17 @@ class Traverse(Spool):
             )
             for row, (frame_index, moment_us, name, shows_nothing, *place, body) in enumerate(rows):
                 names.append(name)
-                index[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
-                blank[row] = shows_nothing
-                encodings[row] = _unpacked(self.name, frame_index, body, dim)
+                indices[row], timestamp_us[row], places[row] = frame_index, moment_us, place  # None becomes NaN
+                is_blank[row] = shows_nothing
+                encodings[row] = _unpack(self.name, frame_index, body, dim)
         position_m, x_m, y_m = places.T.copy()
         return Drive(
-            name=self.name, camera=next(iter(cameras), None), index=index, position_m=position_m,
+            name=self.name, camera=next(iter(cameras), None), index=indices, position_m=position_m,
             timestamp_us=timestamp_us, x_m=x_m, y_m=y_m, frame_name=np.array(names, np.str_), encodings=encodings,
-            weights_sha256=weights_sha256, grey_levels=levels, shows_nothing=blank,
+            weights_sha256=weights_sha256, grey_levels=levels, shows_nothing=is_blank,
         )  # fmt: skip
 
-    def _described(self, db: Database) -> tuple[int | None, str | None]:
+    def _description(self, db: Database) -> tuple[int | None, str | None]:
         """The length of the encodings, and by which weights images were encoded; None where there are none yet."""
         row: tuple[int | None, str | None] | None = db.execute(
             "SELECT encoding_dim, weights_sha256 FROM traverse"
@@ -364,15 +367,15 @@ class Traverse(Spool):
         return row
 
 
-def _known(db: Database, among: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
-    """As `Traverse.known`, of the frames of some indices alone or of all."""
-    chosen = "" if among is None else "WHERE frame_index IN (SELECT value FROM json_each(?))"
+def _identities(db: Database, indices: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
+    """As `Traverse.identities`, of the frames at `indices` (None: all)."""
+    condition = "" if indices is None else "WHERE frame_index IN (SELECT value FROM json_each(?))"
     rows = db.execute(
         f"""
         SELECT frame_index, position_m, coalesce(timestamp_us, -1), x_m, y_m, coalesce(content_digest, 0)
-        FROM frame {chosen} ORDER BY frame_index
+        FROM frame {condition} ORDER BY frame_index
         """,  # noqa: S608 - of our own words
-        [] if among is None else [to_json(among.tolist())],
+        [] if indices is None else [to_json(indices.tolist())],
     ).fetchall()
     index, position_m, timestamp_us, x_m, y_m, content = zip(*rows, strict=True) if rows else [()] * 6
     return {
@@ -395,11 +398,11 @@ def _keep_levels(db: Database, levels: tuple[int, int] | None) -> None:
         db.execute("UPDATE traverse SET black = ?, white = ? WHERE black IS NULL", list(levels))
 
 
-def _digest(known: dict[str, NDArray[Any]]) -> str | None:
-    if not known["index"].size or (known["content_digest"] == UNKNOWN_CONTENT).any():
+def _digest(identities: dict[str, NDArray[Any]]) -> str | None:
+    if not identities["index"].size or (identities["content_digest"] == UNKNOWN_CONTENT).any():
         return None
     digest = hashlib.sha256()
-    for array in known.values():
+    for array in identities.values():
         digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
     return digest.hexdigest()
 
@@ -414,19 +417,19 @@ def _main_camera(data_dir: Path, domain: str, name: str, _: FileState) -> Camera
 def _uninformative(path: Path, _: FileState) -> tuple[int, int]:
     """How many pictures show nothing by themselves, and how many of the others as `Drive.is_unlike_all`."""
 
-    def counted(db: Database) -> tuple[int, int]:
+    def count_frames(db: Database) -> tuple[int, int]:
         (dim,) = db.execute("SELECT encoding_dim FROM traverse").fetchone()
         frames = "FROM frame LEFT JOIN encoding USING (frame_index) ORDER BY frame_index"
         is_blank = np.array([row[0] for row in db.execute(f"SELECT coalesce(shows_nothing, 0) {frames}")], np.bool_)
 
         def blocks() -> Iterator[NDArray[np.float32]]:
             rows = db.execute(f"SELECT frame_index, body {frames}")
-            while some := rows.fetchmany(_ROWS_AT_ONCE):
-                yield np.stack([_unpacked(path.stem, index, body, dim) for index, body in some])
+            while block := rows.fetchmany(_ROWS_AT_ONCE):
+                yield np.stack([_unpack(path.stem, index, body, dim) for index, body in block])
 
         return int(is_blank.sum()), int((shows_nothing(blocks) & ~is_blank).sum())
 
-    return look_at(path, counted)
+    return look_at(path, count_frames)
 
 
 def _cameras(db: Database) -> tuple[Camera, ...]:
@@ -439,12 +442,12 @@ def _cameras(db: Database) -> tuple[Camera, ...]:
     return tuple(Camera(*row) for row in rows)
 
 
-def _packed(encoding: NDArray[np.float32]) -> bytes:
+def _pack(encoding: NDArray[np.float32]) -> bytes:
     return encoding.astype("<f2" if is_halvable(encoding) else "<f4").tobytes()
 
 
-def _unpacked(name: str, frame_index: int, body: bytes | None, dim: int | None) -> NDArray[np.float32]:
-    """[d] of a frame of the traverse; raises DamagedFileError."""
+def _unpack(name: str, frame_index: int, body: bytes | None, dim: int | None) -> NDArray[np.float32]:
+    """The encoding [d] of a frame; raises DamagedFileError."""
     dtype = _DTYPE_OF_BYTES.get(len(body or b"") / (dim or 1))  # a single number would be broadcast
     if dtype is None:
         raise DamagedFileError(
@@ -474,5 +477,5 @@ def _locked_folder(folder: Path, domain: str) -> Iterator[None]:
 
 
 def _unknown(data_dir: Path, domain: str, name: str) -> UnknownTraverseError:
-    known = Traverse.list(data_dir, domain)
-    return UnknownTraverseError(f"domain {domain} has no traverse {name}{nearest_of(name, known)}", known=known[:20])
+    names = Traverse.list(data_dir, domain)
+    return UnknownTraverseError(f"domain {domain} has no traverse {name}{nearest_of(name, names)}", known=names[:20])
