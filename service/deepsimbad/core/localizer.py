@@ -105,7 +105,7 @@ class ActiveLocalizer:
             shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
             seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
             belief = belief.updated(seen, number)
-            told = belief.told
+            told = belief.mass_moved
         laps.append(self._clock())
 
         after = LocalizerState(belief, live, relevance, number + 1)

@@ -147,7 +147,7 @@ class Route:
     @cached_property
     def cells(self) -> Cells:
         """Of equal length, for a grid belief."""
-        return Cells.along(self.places.position_m, self.length_m, self.closed)
+        return Cells.for_places(self.places.position_m, self.length_m, self.closed)
 
     @cached_property
     def heading_rad(self) -> NDArray[np.float64]:

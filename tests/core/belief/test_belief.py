@@ -435,7 +435,7 @@ def test_cells_of_a_loop_hear_of_a_view_between_the_places_beside_them(gap_m, of
     """However near the loop's last place is to its first."""
     place_m = np.array([3.0, 4.0, 6.0, 8.0, 10.0])
     values, length_m = np.array([5.0, 1.0, -2.0, 0.0, 7.0]), 7.0 + gap_m
-    cells = Cells.along(place_m, length_m, closed=True)
+    cells = Cells.for_places(place_m, length_m, closed=True)
     at_m = cells.position_m + offset_m * cells.step_m
     expected = np.interp(at_m, place_m, values, period=length_m)
     np.testing.assert_allclose(cells.of_places(values, offset_m * cells.step_m), expected, atol=1e-9)
@@ -448,7 +448,7 @@ def test_cells_that_are_places_are_as_others(n, closed, offset):
     """Of places at equal distances nothing is looked for; one that is off by a hair makes them be looked for."""
     values, place_m = np.random.default_rng(0).random(n), 5 + 0.2 * np.arange(n)
     off_m = place_m + 1e-5 * (np.arange(n) == n - 1)
-    same, looked_for = (Cells.along(at_m, 0.2 * (n if closed else n - 1), closed) for at_m in (place_m, off_m))
+    same, looked_for = (Cells.for_places(at_m, 0.2 * (n if closed else n - 1), closed) for at_m in (place_m, off_m))
     assert same.are_places
     assert not looked_for.are_places
     for of in ("of_places", "to_places"):

@@ -1,7 +1,7 @@
 """The exact belief: masses of equal cells along the route.
 
-A move shifts them all, and its error is one short row of weights, the same everywhere; a view is heard of at cells,
-between two map images as the way leads to the other.
+A move shifts all cells, and its error is one short row of weights, the same everywhere. What a view says of map images
+is interpolated at the cells between them.
 """
 
 from dataclasses import dataclass
@@ -33,23 +33,23 @@ from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.core.route import Route
 
 _BLOCK = 1024  # cells whose sums stay in the first-level cache
-_ROUNDED = 1e-6  # 1 less what is lost or leaves is summed anew below this, where rounding would be felt
-_NOTHING = 1e-300  # what a view leaves of a belief that it does not allow, or less
+_ROUNDED = 1e-6  # of a mass; a difference below it is summed anew, since rounding would be felt
+_NOTHING = 1e-300  # of a mass: a view that leaves no more of a belief excludes it
 
 
 @dataclass(frozen=True)
 class GridFilter:
-    """Masses of cells."""
+    """A belief of c cells, by each of t trusts. Nothing is random."""
 
     route: Route
     masses: NDArray[np.float64]  # [t, c] by trust; with `doubt.lost` each row sums to 1
     offset_m: float  # by which all cells are ahead of where they began, at most half a cell
     doubt: Doubt  # its last view at the cells
-    told: float = 0.0  # share of the mass that the last view moved elsewhere, or would have where nothing was known
+    mass_moved: float = 0.0  # share that the last view moved elsewhere, or would have of a belief that knew nothing
 
     @classmethod
     def uniform(cls, route: Route, rule: UpdateRule = UpdateRule.MIXTURE) -> Self:
-        """No knowledge: every metre of the route alike."""
+        """The belief that knows nothing: every metre of the route is equally likely."""
         return cls._of(route, np.ones(route.cells.n_cells), 0.0, rule, LOST_AT_START)
 
     @classmethod
@@ -69,21 +69,21 @@ class GridFilter:
 
     @classmethod
     def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]]) -> Self:
-        """Restore what `arrays` gave; raises KeyError where an earlier release did."""
+        """The belief whose arrays `arrays` gave; raises KeyError for those of another release."""
         return cls(route, arrays["masses"], float(arrays["offset_m"][0]), Doubt.from_arrays(arrays))
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All state."""
+        """The named arrays from which `from_arrays` restores it."""
         return {"masses": self.masses, "offset_m": np.array([self.offset_m]), **self.doubt.arrays()}
 
     @cached_property
     def _believed(self) -> NDArray[np.float64]:
-        """[c] of the cells, if the robot is on the route; sums to 1."""
+        """[c] belief of cells, provided that the robot is on the route; sums to 1."""
         return _mixed(self.masses, self.doubt.lost, self.doubt.log_trust)
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
-        """[n] of the map images, if the robot is on the route; sums to 1. Images of one stop share its mass."""
+        """[n] belief of map images, if the robot is on the route; sums to 1. A stop's images share a mass."""
         places = self.route.places
         on_places = self.route.cells.to_places(self._believed, self.offset_m)
         if places.position_m.size == self.route.n_images:
@@ -92,18 +92,18 @@ class GridFilter:
 
     @property
     def off_route(self) -> float:
-        """Probability that the robot is not where any of this could be right."""
+        """Probability that the robot is lost: off the route, or anywhere on it after having been carried."""
         return self.doubt.off_route
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> "GridFilter":  # noqa: ARG002 - nothing is random
         """The belief after a move.
 
-        It ends where an open route ends, within its error; what certainly leads past the end is lost.
+        A move ends where an open route ends, within its error; mass that it certainly leads past the end becomes lost.
 
         Args:
             action_m: Metres moved forward; backward where negative.
             action_std_m: Standard deviation of the move, at least 0.
-            step: Number of this step in the session; seeds whatever is random in it.
+            step: Number of this step in the session, which seeds the draws of particles.
 
         Raises:
             PastTheEndError: No place of the belief has that much open route before it.
@@ -111,42 +111,44 @@ class GridFilter:
         cells, doubt, reach_m = self.route.cells, self.doubt, SIGMAS * action_std_m
         shift, offset_m = cells.shifted(self.offset_m + action_m)
         for beyond_m in (reach_m if doubt.is_mixture or action_m == 0 else 0.0, reach_m):
-            some = cells.sources(shift, offset_m, beyond_m)
-            leaving = self.masses[:, : some.start].sum(axis=1) + self.masses[:, some.stop :].sum(axis=1)
+            on_route_cells = cells.sources(shift, offset_m, beyond_m)
+            leaving = self.masses[:, : on_route_cells.start].sum(axis=1) + self.masses[:, on_route_cells.stop :].sum(
+                axis=1
+            )
             surviving = 1 - doubt.lost - leaving
             if surviving.min() < _ROUNDED:
-                surviving = self.masses[:, some].sum(axis=1)
+                surviving = self.masses[:, on_route_cells].sum(axis=1)
             on_route = surviving + leaving
-            if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or self.masses[:, some].any():
+            if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or self.masses[:, on_route_cells].any():
                 break  # else it may still have stopped at the end
         check_ahead(self.route, doubt, on_route, surviving, action_m)
-        lost, staying, found = leaving_and_found(doubt, doubt.lost, on_route, surviving, action_m)
-        total = surviving * staying + found + lost
-        masses = _moved(
+        lost, staying, found_mass = leaving_and_found(doubt, doubt.lost, on_route, surviving, action_m)
+        total = surviving * staying + found_mass + lost
+        masses = _shift_and_spread(
             self.masses,
-            (int(some.start), int(some.stop), shift),
+            (int(on_route_cells.start), int(on_route_cells.stop), shift),
             mixed_error(cells.step_m, cells.n_cells, *move_stds_m(action_m, action_std_m, doubt).items()),
             staying / total,
-            found / (total * cells.n_cells),
+            found_mass / (total * cells.n_cells),
             cells.closed,
         )
-        last = None if doubt.last is None else _carried(doubt.last, shift, cells.closed)
+        last = None if doubt.last is None else _shift(doubt.last, shift, cells.closed)
         return GridFilter(self.route, masses, offset_m, Doubt(lost / total, doubt.log_trust, last))
 
-    def updated(self, seen: ViewEvidence, step: int) -> "GridFilter":  # noqa: ARG002
-        """The belief after a view."""
-        at_cells = self._at_cells(seen.values)
-        if seen.is_added:
-            mass, doubt = added(self._believed, at_cells), self.doubt
-            masses, told = np.outer(1 - doubt.lost, mass), 0.5 * float(np.abs(mass - self._believed).sum())
+    def updated(self, evidence: ViewEvidence, step: int) -> "GridFilter":  # noqa: ARG002
+        """The belief after a view; `step` as of `predicted`."""
+        values = self._at_cells(evidence.values)
+        if evidence.is_added:
+            mass, doubt = added(self._believed, values), self.doubt
+            masses, mass_moved = np.outer(1 - doubt.lost, mass), 0.5 * float(np.abs(mass - self._believed).sum())
         else:
-            likelihood, least_told = seen.likelihood(at_cells, self.doubt.last)
-            masses, lost, log_trust, moved = _see(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
-            doubt, told = Doubt(lost, log_trust, at_cells), max(moved, least_told)
-        return GridFilter(self.route, masses, self.offset_m, doubt, told)
+            likelihood, least_moved = evidence.likelihood(values, self.doubt.last)
+            masses, lost, log_trust, mass_moved = _weigh(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
+            doubt, mass_moved = Doubt(lost, log_trust, values), max(mass_moved, least_moved)
+        return GridFilter(self.route, masses, self.offset_m, doubt, mass_moved)
 
     def _at_cells(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[c] what is known of map images [n]; the images of one stop say what they say on average."""
+        """[c] values at cells, interpolated from those of map images [n]; images of one stop count by their mean."""
         places = self.route.places
         if places.position_m.size < values.size:
             values = np.bincount(places.of_image, values) / places.n_images
@@ -155,13 +157,13 @@ class GridFilter:
 
 @njit(cache=True, nogil=True)
 def _trusted(log_trust: NDArray[np.float64], lost: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[t] by which masses of cells are believed, so that they sum to 1."""
+    """[t] weights of the trusts, with which their masses together sum to 1."""
     weight = np.exp(log_trust - log_trust.max())
     return np.asarray(weight / max((weight * (1.0 - lost)).sum(), _NOTHING))
 
 
 @njit(cache=True, nogil=True)
-def _see(
+def _weigh(
     masses: NDArray[np.float64],
     lost: NDArray[np.float64],
     log_trust: NDArray[np.float64],
@@ -169,32 +171,37 @@ def _see(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
     """Multiply by likelihoods [c] of the least trust, normalise, and weigh the trusts.
 
-    Where a view allows nothing that a trust still believes, that trust keeps what it knew of places: there is always
-    something to go on from, however surely the robot is lost.
+    Where a view excludes all that a trust still believes, that trust keeps its shares of places: there is always a
+    belief to go on from, however surely the robot is lost.
 
     Returns:
-        Masses [t, c], lost [t], log trusts [t], and the share of what is believed that moved.
+        Masses [t, c], lost [t], log trusts [t], and the share of the belief that moved elsewhere.
     """
     average, total = _likelihoods(masses, likelihood)
-    gain, kept, lost_after, log_trust_after = np.zeros(lost.size), np.zeros(lost.size), lost.copy(), log_trust.copy()
+    gain, kept_share, lost_after, log_trust_after = (
+        np.zeros(lost.size),
+        np.zeros(lost.size),
+        lost.copy(),
+        log_trust.copy(),
+    )
     for t in range(lost.size):
         if total[t] <= _NOTHING:
             total[t] = LEAST_ALLOWED * average[t]
-            kept[t] = total[t] / max(masses[t].sum(), _NOTHING)
-        whole = total[t] + lost[t] * average[t]
-        gain[t] = 1.0 / whole
+            kept_share[t] = total[t] / max(masses[t].sum(), _NOTHING)
+        explained = total[t] + lost[t] * average[t]
+        gain[t] = 1.0 / explained
         lost_after[t] = lost[t] * average[t] * gain[t]
-        log_trust_after[t] += np.log(whole / average[t])
+        log_trust_after[t] += np.log(explained / average[t])
     weights = _trusted(log_trust, lost), _trusted(log_trust_after, lost_after)
-    after, moved = _multiplied(masses, likelihood, kept, gain, weights[0], weights[1])
-    return after, lost_after, log_trust_after, 0.5 * moved
+    posterior, change = _multiplied(masses, likelihood, kept_share, gain, weights[0], weights[1])
+    return posterior, lost_after, log_trust_after, 0.5 * change
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _mixed(
     masses: NDArray[np.float64], lost: NDArray[np.float64], log_trust: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[c] what the trusts believe together, if the robot is on the route; sums to 1."""
+    """[c] belief of cells over all trusts, provided that the robot is on the route; sums to 1."""
     weight = _trusted(log_trust, lost)
     mixed = weight[0] * masses[0]
     for t in range(1, weight.size):
@@ -208,16 +215,16 @@ def _mixed(
 def _likelihoods(
     masses: NDArray[np.float64], likelihood: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[t], [t] means of likelihoods [c], over all cells and over what each trust believes."""
+    """[t], [t] mean of each trust's likelihoods [c], over all cells and weighed by its masses."""
     n_trusts, n = masses.shape
     mean, total = np.empty(n_trusts), np.empty(n_trusts)
     powers = likelihood.copy()
     for t in range(n_trusts):
-        row, everywhere, believed = masses[t], 0.0, 0.0
+        row, all_cells, weighed = masses[t], 0.0, 0.0
         for i in range(n):
-            everywhere += powers[i]
-            believed += row[i] * powers[i]
-        mean[t], total[t] = everywhere / n, believed
+            all_cells += powers[i]
+            weighed += row[i] * powers[i]
+        mean[t], total[t] = all_cells / n, weighed
         for i in range(n):
             powers[i] *= powers[i]  # the next trust is twice this one
     return mean, total
@@ -227,57 +234,56 @@ def _likelihoods(
 def _multiplied(
     masses: NDArray[np.float64],
     likelihood: NDArray[np.float64],
-    kept: NDArray[np.float64],
+    kept_share: NDArray[np.float64],
     gain: NDArray[np.float64],
     weight: NDArray[np.float64],
     weight_after: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Masses [t, c] times likelihoods and gains [t], and the sum of differences of what is believed.
+    """Masses [t, c] times likelihoods and gains [t], and the sum over cells of how far the belief changes.
 
     Args:
-        kept: [t] in place of likelihoods, where that is not 0.
-        weight, weight_after: [t] by which masses before and after are believed.
+        kept_share: [t] used in place of likelihoods where it is not 0.
+        weight, weight_after: [t] weights of the trusts before and after.
     """
     n_trusts, n = masses.shape
-    after, moved = np.empty((n_trusts, n)), 0.0
+    posterior, total_change = np.empty((n_trusts, n)), 0.0
     for begin in range(0, n, _BLOCK):
         powers = likelihood[begin : begin + _BLOCK].copy()
         change = np.zeros(powers.size)
         for t in range(n_trusts):
-            before, row = masses[t, begin : begin + _BLOCK], after[t, begin : begin + _BLOCK]
-            times, plus = 0.0 if kept[t] > 0 else gain[t], kept[t] * gain[t]
+            prior, row = masses[t, begin : begin + _BLOCK], posterior[t, begin : begin + _BLOCK]
+            factor, kept_factor = 0.0 if kept_share[t] > 0 else gain[t], kept_share[t] * gain[t]
             share, share_after = weight[t], weight_after[t]
             for i in range(powers.size):
-                row[i] = before[i] * (powers[i] * times + plus)
-                change[i] += share_after * row[i] - share * before[i]
+                row[i] = prior[i] * (powers[i] * factor + kept_factor)
+                change[i] += share_after * row[i] - share * prior[i]
                 powers[i] *= powers[i]
         for i in range(powers.size):
-            moved += abs(change[i])
-    return after, moved
+            total_change += abs(change[i])
+    return posterior, total_change
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _moved(
+def _shift_and_spread(
     masses: NDArray[np.float64],
     move: tuple[int, int, int],
     taps: NDArray[np.float64],
     gain: NDArray[np.float64],
-    found: NDArray[np.float64],
+    found_mass: NDArray[np.float64],
     closed: bool,
 ) -> NDArray[np.float64]:
-    """Shift the masses [t, c] of some cells, spread them by a move's error, and add what was found everywhere.
+    """Shift the masses [t, c] of a range of cells, spread them by a move's error, and add what is found everywhere.
 
     Args:
         move: The first cell that is shifted, the first that is not any more, and by how many cells.
-        taps: [2 w + 1] the error, the same to either side. Of what it would carry past an end of an open route nothing
-            is lost.
-        gain: [t] that masses are multiplied by.
-        found: [t] added to every cell.
+        taps: [2 w + 1] weights of the error, symmetric. What it would carry past an end of an open route stays on it.
+        gain: [t] factors of the masses.
+        found_mass: [t] added to every cell.
     """
     n_trusts, n = masses.shape
     first, stop, shift = move
     width = taps.size // 2
-    moved = np.empty((n_trusts, n))
+    shifted = np.empty((n_trusts, n))
     source = np.empty(n + 2 * width)
     on_route = source[width : width + n]
     for t in range(n_trusts):
@@ -288,25 +294,25 @@ def _moved(
             source[:width] = source[n : n + width]
             source[width + n :] = source[width : 2 * width]
         else:
-            least = max(first, -shift)  # cells from here on need not be held at an end,
-            most = max(least, min(stop, n - shift))  # until here
-            source[: width + least + shift] = 0.0
-            on_route[least + shift : most + shift] = masses[t, least:most]
-            source[width + most + shift :] = 0.0
-            for i in range(first, min(least, stop)):
+            first_inside = max(first, -shift)  # cells from here on do not move past an end,
+            stop_inside = max(first_inside, min(stop, n - shift))  # until here
+            source[: width + first_inside + shift] = 0.0
+            on_route[first_inside + shift : stop_inside + shift] = masses[t, first_inside:stop_inside]
+            source[width + stop_inside + shift :] = 0.0
+            for i in range(first, min(first_inside, stop)):
                 on_route[0] += masses[t, i]
-            for i in range(max(most, first), stop):
+            for i in range(max(stop_inside, first), stop):
                 on_route[n - 1] += masses[t, i]
             near = min(width, n)
-            for end in range(near + min(width, n - near)):  # of what is near an end, what stays on the route is all
-                i = end if end < near else n - 1 - (end - near)
+            for edge in range(near + min(width, n - near)):  # mass near an end stays on the route
+                i = edge if edge < near else n - 1 - (edge - near)
                 on_route[i] /= taps[max(width - i, 0) : width + n - i].sum()
         for begin in range(0, n, _BLOCK):
-            row = moved[t, begin : begin + _BLOCK]
+            row = shifted[t, begin : begin + _BLOCK]
             middle = source[begin + width : n + 2 * width]
             weight = taps[width] * gain[t]
             for i in range(row.size):
-                row[i] = found[t] + weight * middle[i]
+                row[i] = found_mass[t] + weight * middle[i]
             for away in range(1, width + 1, 2):  # two cells to either side at once; one that is no more weighs nothing
                 reach = min(away + 1, width)
                 near, far = taps[width + away] * gain[t], taps[width + reach] * gain[t] if reach > away else 0.0
@@ -314,18 +320,18 @@ def _moved(
                 lefter, righter = source[begin + width - reach :], source[begin + width + reach :]
                 for i in range(row.size):
                     row[i] += near * (left[i] + right[i]) + far * (lefter[i] + righter[i])
-    return moved
+    return shifted
 
 
 @njit(cache=True, nogil=True)
-def _carried(values: NDArray[np.float64], shift: int, closed: bool) -> NDArray[np.float64]:
-    """[c] what was seen at cells, where a robot that moves has it next; what lies before an open route is 0."""
+def _shift(values: NDArray[np.float64], shift: int, closed: bool) -> NDArray[np.float64]:
+    """[c] values at cells, moved along with the robot by whole cells; what lies before an open route is 0."""
     carried, n = np.zeros_like(values), values.size
-    turn = shift % n if closed else min(max(shift, -n), n)
-    if turn >= 0:
-        carried[turn:] = values[: n - turn]
+    by = shift % n if closed else min(max(shift, -n), n)
+    if by >= 0:
+        carried[by:] = values[: n - by]
     else:
-        carried[:turn] = values[-turn:]
+        carried[:by] = values[-by:]
     if closed:
-        carried[:turn] = values[n - turn :]
+        carried[:by] = values[n - by :]
     return carried

@@ -42,7 +42,7 @@ class ParticleFilter:
     found: NDArray[np.float64]  # [t] what may be anywhere again; the next view says where
     doubt: Doubt
     seed: int  # of all draws
-    told: float = 0.0  # as `GridFilter.told`
+    mass_moved: float = 0.0  # see `GridFilter.mass_moved`
 
     @classmethod
     def uniform(
@@ -162,7 +162,7 @@ class ParticleFilter:
             weighed = replace(self, weights=weights / total[:, np.newaxis], found=found / total, doubt=doubt)
             after = weighed._placed(way, step) if doubt.is_mixture else weighed._evened_out(step)
         moved = 0.5 * float(np.abs(weighed._believed - self._believed).sum())
-        return replace(after, told=max(moved, least_told))
+        return replace(after, mass_moved=max(moved, least_told))
 
     def _likelihoods(self, way: "_Way") -> NDArray[np.float64]:
         """[t, m] of the particles, by trust: on average over the stretches that they stand for, where they do."""

@@ -13,9 +13,10 @@ from deepsimbad.core.route import Route
 CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side
 DEFAULT_CONFIDENCE = 0.99
 _CREDIBLE_SHARE = 0.95
-_SIZES = 1024  # sixteen an octave: of masses below the greatest; what is smaller is nothing
+_ENOUGH = 1 - 1e-12  # of that share: sums are rounded
+_SIZES = 1024  # classes of masses, sixteen an octave below the greatest; smaller ones count as the last
 _TO_SIZE = 48  # bits of a double below its exponent and the four that cut an octave
-_NOTHING = np.finfo(np.float32).tiny
+_NOTHING = np.finfo(np.float32).tiny  # the least mass whose logarithm is taken
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _near(mass: NDArray[np.float64], position_m: NDArray[np.float64], mode: int, turn_m: float) -> float:
-    """As `near_mode`; a turn of a closed route leads back to where it began, of an open one it is 0."""
+    """See `near_mode`; `turn_m` is the length of a closed route, 0 of an open one."""
     if 0 < turn_m <= 2 * CONFIDENT_WITHIN_M:
         return float(mass.sum())
     near = 0.0
@@ -93,14 +94,14 @@ def _figures(
     length_m: float,
     bin_m: float,
 ) -> tuple[float, float, float, NDArray[np.int64]]:
-    """All that is summed over the map, in one call: between two the interpreter would have to be waited for.
+    """All that is summed over the map, in one call, since between two calls a thread waits for the interpreter.
 
     Returns:
         Mean, standard deviation, entropy, and [2, s] ends of the stretches of the smallest set.
     """
     mean_m, std_m = _moments(mass, position_m, turn, length_m)
-    entropy_bits, least = _entropy_and_least(mass, bits, _CREDIBLE_SHARE)
-    return mean_m, std_m, entropy_bits, _stretches(mass, least, position_m, bin_m)
+    entropy_bits, least_mass = _entropy_and_least(mass, bits, _CREDIBLE_SHARE)
+    return mean_m, std_m, entropy_bits, _stretches(mass, least_mass, position_m, bin_m)
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
@@ -129,8 +130,8 @@ def _moments(
 def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float32], share: float) -> tuple[float, float]:
     """Entropy in bits, and the least mass in the smallest set of images that holds a share.
 
-    Not all are sorted: they are summed by size, and the class where the share is reached is. Doubles that are not
-    negative are in the order of their patterns.
+    Rather than sort all masses, sum them by classes of size, and sort the one class where the share is reached. The bit
+    patterns of doubles that are not negative are in the doubles' order.
     """
     pattern, greatest, entropy = mass.view(np.int64), 0, 0.0
     for i in range(mass.size):
@@ -142,27 +143,27 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float32], sha
     by_turns = np.zeros((4, _SIZES))  # so that an addition need not wait for the one before it
     for i in range(mass.size):
         by_turns[i & 3, size_class[i]] += mass[i]
-    held = by_turns[0] + by_turns[1] + by_turns[2] + by_turns[3]
-    total, last = 0.0, 0
-    while last < held.size - 1 and total + held[last] < share * (1 - 1e-12):
-        total += held[last]
-        last += 1
-    within = np.empty(mass.size)
+    class_mass = by_turns[0] + by_turns[1] + by_turns[2] + by_turns[3]
+    total, last_class = 0.0, 0
+    while last_class < class_mass.size - 1 and total + class_mass[last_class] < share * _ENOUGH:
+        total += class_mass[last_class]
+        last_class += 1
+    class_members = np.empty(mass.size)
     count = 0
     for i in range(mass.size):
-        if size_class[i] == last:
-            within[count] = mass[i]
+        if size_class[i] == last_class:
+            class_members[count] = mass[i]
             count += 1
-    ascending = np.sort(within[:count])
+    ascending = np.sort(class_members[:count])
     for at in range(count - 1, -1, -1):
         total += ascending[at]
-        if total >= share * (1 - 1e-12):
+        if total >= share * _ENOUGH:
             return entropy, ascending[at]
     return entropy, ascending[0] if count else mass.max()
 
 
 def _pieces(route: Route, ends: NDArray[np.int64]) -> list[tuple[float, float]]:
-    """The stretches of the smallest set, from and to, in the order in which they are told."""
+    """The pieces of the smallest set, each from and to, in route order; on a closed route after the greatest gap."""
     first_m, last_m = route.position_m[ends].tolist()
     pieces = list(zip(first_m, last_m, strict=True))
     if not route.closed or len(pieces) == 1:
@@ -176,12 +177,12 @@ def _pieces(route: Route, ends: NDArray[np.int64]) -> list[tuple[float, float]]:
 
 @njit(cache=True, nogil=True)
 def _stretches(
-    mass: NDArray[np.float64], least: float, position_m: NDArray[np.float64], gap_m: float
+    mass: NDArray[np.float64], least_mass: float, position_m: NDArray[np.float64], gap_m: float
 ) -> NDArray[np.int64]:
-    """[2, s] first and last of neighbours that hold at least so much; those nearer together than a gap are one."""
+    """[2, s] first and last of each run of images with `least_mass` or more; runs nearer than `gap_m` are one."""
     ends, n = np.empty((2, mass.size), np.int64), 0
     for image in range(mass.size):
-        if mass[image] < least:
+        if mass[image] < least_mass:
             continue
         last = ends[1, n - 1]
         if n > 0 and (last == image - 1 or position_m[image] - position_m[last] <= gap_m):
