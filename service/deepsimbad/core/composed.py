@@ -23,14 +23,16 @@ PRIOR_WEIGHT_FRAMES = 20.0  # how many live views the map's statistics are worth
 MOST_DIMENSIONS = 96  # of u; longer encodings are projected
 SECOND_SEASON_WEIGHT = 0.8  # of the landmark drive's view of a place beside the training drive's
 LEAST_SHARED_PLACES = 100  # that within-place scatter is learnt from
-_EVENING_OUT = 5.0  # of the mean variance: how far a projection's strong dimensions are held back
+_EVENING_OUT = 5.0  # times the mean variance, by which a projection's strong dimensions are held back
 _BEAM = 8  # partial lists that are followed at once
-_STILL, _MUTE = 1e-6, 1e6  # of the greatest deviation: what moves less tells nothing, and is divided by so much
+_STILL = 1e-6  # of the greatest standard deviation: a number whose own is less tells nothing
+_MUTE = 1e6  # of the greatest standard deviation: what such a number gets in place of its own
 _BARRED = np.float32(-1e9)
 _ROWS_AT_ONCE = 1024
-_SWEEPS, _INERTIA = 4, 0.5  # over which landmarks move to what lists them, and what where they stand counts beside that
-_MOST_TAUGHT_BY = 4096  # places that landmarks are moved by
-_MOST_FRAMES = 2048  # that principal directions are found from
+_SWEEPS = 4  # rounds in which landmarks are moved towards the places that list them
+_INERTIA = 0.5  # what a landmark's own position counts in a round
+_MOST_TAUGHT_BY = 4096  # places from which landmarks learn
+_MOST_FRAMES = 2048  # from which principal directions are computed
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,9 @@ class Moments:
 
     @classmethod
     def of(cls, *drives: NDArray[np.float32]) -> Self:
-        """Mean of the drives' means, mean of their variances: what is usual for a view of an unknown season.
+        """Mean of the drives' means, mean of their variances: those to expect of a view of an unknown season.
 
-        A number that stood still in one of the drives has so great a deviation that it says nothing.
+        A number that stood still in one of the drives gets so great a deviation that it tells nothing.
         """
         means = [drive.mean(axis=0, dtype=np.float64) for drive in drives]
         variances = [_telling(drive.var(axis=0, dtype=np.float64)) for drive in drives]
@@ -55,7 +57,7 @@ class Moments:
 
     @classmethod
     def of_blocks(cls, blocks: Iterable[NDArray[np.float32]]) -> Self:
-        """As `of` one drive, whose frames come in blocks [_, d]."""
+        """`of` one drive, whose frames come in blocks [_, d]."""
         n_frames, total, squares = 0, np.zeros(1), np.zeros(1)
         for block in blocks:
             n_frames += len(block)
@@ -67,7 +69,7 @@ class Moments:
 
     @classmethod
     def counted(cls, frames: NDArray[np.float32]) -> Self:
-        """As they are, to be pooled: what stood still in a few frames may move in others."""
+        """Of a few frames [n, d], to be `pooled`: a number that stands still in them may move in others."""
         mean = frames.mean(axis=0, dtype=np.float64)
         return cls(cls.prior_weight, mean, frames.var(axis=0, dtype=np.float64) + np.square(mean))
 
@@ -87,25 +89,24 @@ class Moments:
         return np.stack([self.mean, self.std]).astype(np.float32)
 
     def observing(self, row: NDArray[np.float32], worth: float = 1.0) -> Self:
-        """With one view more; `worth` of one that saw little new is less than 1."""
+        """With one view [d] more, NaN where a number is unknown; `worth` is less than 1 of one that saw little new."""
         weight = self.weight + worth
         share, value = worth / weight, row.astype(np.float64)
-        more, square = share * (value - self.mean), share * (np.square(value) - self.square)
-        is_told = ~np.isnan(value)  # what was not told teaches nothing
-        mean, square = self.mean + np.where(is_told, more, 0), self.square + np.where(is_told, square, 0)
+        mean_step, square_step = share * (value - self.mean), share * (np.square(value) - self.square)
+        is_known = ~np.isnan(value)
+        mean = self.mean + np.where(is_known, mean_step, 0)
+        square = self.square + np.where(is_known, square_step, 0)
         return replace(self, weight=weight, mean=mean, square=square)
 
     def pooled(self, n_frames: float, other: "Moments", n_others: float) -> Self:
-        """Those of two drives together, each counted by its frames; the weight stays this one's."""
+        """The moments of two drives together, each weighted by its number of frames; the weight stays this one's."""
         share = n_others / (n_frames + n_others)
-        mean, square = (
-            mine + (theirs - mine) * share for mine, theirs in ((self.mean, other.mean), (self.square, other.square))
-        )
-        return replace(self, mean=mean, square=square)
+        mean = self.mean + (other.mean - self.mean) * share
+        return replace(self, mean=mean, square=self.square + (other.square - self.square) * share)
 
 
 def _telling(variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[d] with so great a variance in place of none that the number says nothing."""
+    """Variances [d], where a number that stands still has so great a one that it tells nothing."""
     greatest = variance.max() or 1.0
     return np.where(variance <= _STILL**2 * greatest, _MUTE**2 * greatest, variance)
 
@@ -117,40 +118,40 @@ def unit(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def unit_encodings(
-    encodings: NDArray[np.float32], usual: Moments, projection: NDArray[np.float32] | None
+    encodings: NDArray[np.float32], moments: Moments, projection: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
-    """u of encodings [..., d] by what is usual for them: [..., k], k = d without a projection [d, k]."""
-    rows = standardised(encodings, usual)
+    """u [..., k] float32 of encodings [..., d] by their moments; k = d without a projection [d, k]."""
+    rows = standardised(encodings, moments)
     return unit(rows if projection is None else rows @ projection)
 
 
-def standardised(encodings: NDArray[np.float32], usual: Moments) -> NDArray[np.float32]:
-    """Encodings [..., d] in deviations from what is usual; a number that was not told, NaN, is as usual."""
-    deviations = ((encodings - usual.mean) / usual.std).astype(np.float32)
+def standardised(encodings: NDArray[np.float32], moments: Moments) -> NDArray[np.float32]:
+    """Encodings [..., d] in standard deviations from their mean, float32; an unknown number, NaN, becomes 0."""
+    deviations = ((encodings - moments.mean) / moments.std).astype(np.float32)
     return np.where(np.isnan(deviations), np.float32(0), deviations)
 
 
 def described(
-    encodings: NDArray[np.float32], usual: Moments, projection: NDArray[np.float32] | None
+    encodings: NDArray[np.float32], moments: Moments, projection: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
     """`unit_encodings` of a whole drive, [n, k], block by block."""
     blocks = range(0, len(encodings), _ROWS_AT_ONCE)
-    return np.concatenate([unit_encodings(encodings[at : at + _ROWS_AT_ONCE], usual, projection) for at in blocks])
+    return np.concatenate([unit_encodings(encodings[i : i + _ROWS_AT_ONCE], moments, projection) for i in blocks])
 
 
 def principal_directions(
     *drives: NDArray[np.float32], halves: Sequence[int] = (), on_progress: Callable[[float], None] = lambda _: None
 ) -> NDArray[np.float32] | None:
-    """[d, k] the directions in which frames differ most, the strongest held back a little.
+    """[d, k] float32, the directions in which frames differ most, the strongest held back a little.
 
-    Numbers are standardised, and then weighed by how much they differ along the drives: of thousands many hardly do,
+    Numbers are standardised, and then weighted by how much they differ along the drives: of thousands many hardly do,
     and their noise would count as much as what shows places. k is 96 or the number of frames less 1, whichever is
-    less. By the matrix of products between frames, at most 2,048 of them, so that no d x d matrix need exist.
+    less. They come from the matrix of products between at most 2,048 frames, so that no d x d matrix need exist.
 
     Args:
         drives: [n, d] encodings of each.
-        halves: Lengths of encodings that lie side by side in one. Each has its own 96 directions, all halves of them
-            the same mean square, so that none drowns another and each is compared alone as well as may be.
+        halves: Lengths of the encodings that lie side by side in each row. Each half has 96 directions of its own, and
+            all have the same mean square, so that none drowns another and each can be compared alone.
 
     Returns:
         None where d is no more than 96.
@@ -159,13 +160,12 @@ def principal_directions(
         return _side_by_side(halves, drives, on_progress)
     if drives[0].shape[1] <= MOST_DIMENSIONS:
         return None
-    most = _MOST_FRAMES // len(drives)
-    some = [drive[np.linspace(0, len(drive) - 1, min(len(drive), most)).astype(np.intp)] for drive in drives]
-    spread = np.mean([rows.std(axis=0, dtype=np.float64) for rows in some], axis=0)
+    n_per_drive = _MOST_FRAMES // len(drives)
+    samples = [drive[np.linspace(0, len(drive) - 1, min(len(drive), n_per_drive)).astype(np.intp)] for drive in drives]
+    spread = np.mean([rows.std(axis=0, dtype=np.float64) for rows in samples], axis=0)
     weight = (spread / max(spread.mean(), 1e-300)).astype(np.float32)
-    frames = np.concatenate(
-        [unit(unit_encodings(rows, Moments.of(drive), None) * weight) for rows, drive in zip(some, drives, strict=True)]
-    )
+    pairs = zip(samples, drives, strict=True)
+    frames = np.concatenate([unit(unit_encodings(rows, Moments.of(drive), None) * weight) for rows, drive in pairs])
     on_progress(0.4)
     k = max(1, min(MOST_DIMENSIONS, len(frames) - 1))
     products = (frames @ frames.T).astype(np.float64) / len(frames)
@@ -180,7 +180,7 @@ def principal_directions(
 def _side_by_side(
     halves: Sequence[int], drives: Sequence[NDArray[np.float32]], on_progress: Callable[[float], None]
 ) -> NDArray[np.float32]:
-    """[d, k] the directions of every half, which are nothing to the others."""
+    """[d, k] float32, the directions of every half, 0 for the numbers of the others."""
     blocks, first = [], 0
     for width in halves:
         parts = [np.ascontiguousarray(drive[:, first : first + width]) for drive in drives]
@@ -199,7 +199,7 @@ def _side_by_side(
 
 
 def within_place_whitening(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    """P = (C + s mean(eig C) I)^-1/2 [k, k]: what a season changes of a place counts less.
+    """P = (C + s mean(eig C) I)^-1/2 [k, k]: the more seasons change a direction, the less it counts.
 
     C is the covariance of the difference between [m, k] unit encodings of the same places in two seasons, and
     s = 0.3 + 64 / m.
@@ -212,8 +212,8 @@ def within_place_whitening(first: NDArray[np.float32], second: NDArray[np.float3
 
 @cache
 def list_weights(list_length: int) -> NDArray[np.float32]:
-    """[h] float32, frozen."""
-    weights = np.array([WEIGHTS[min(place, len(WEIGHTS) - 1)] for place in range(list_length)], np.float32)
+    """[h] float32 weights of the landmarks of a list, by position; frozen."""
+    weights = np.array([WEIGHTS[min(position, len(WEIGHTS) - 1)] for position in range(list_length)], np.float32)
     weights.setflags(write=False)
     return weights
 
@@ -224,7 +224,7 @@ def compose(
     list_length: int,
     barred: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.uint16]:
-    """The lists of all map images, by a beam search.
+    """The lists of all map images, each found by a beam search.
 
     Args:
         places: [n, k] unit.
@@ -239,11 +239,11 @@ def compose(
     gram = np.ascontiguousarray(landmarks @ landmarks.T)
     lists = np.empty((len(places), list_length), np.uint16)
     for start in range(0, len(places), _ROWS_AT_ONCE):
-        some = slice(start, start + _ROWS_AT_ONCE)
-        products = np.ascontiguousarray(places[some] @ landmarks.T)
+        block = slice(start, start + _ROWS_AT_ONCE)
+        products = np.ascontiguousarray(places[block] @ landmarks.T)
         if barred is not None:
-            products[barred[some]] = _BARRED
-        _search(products, gram, weights, lists[some])
+            products[barred[block]] = _BARRED
+        _search(products, gram, weights, lists[block])
     return np.ascontiguousarray(lists.T)
 
 
@@ -253,13 +253,13 @@ def learnt_landmarks(
     list_length: int,
     barred: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """[r, k] unit landmarks whose weighted sums come nearer to the places than those of the frames they begin as.
+    """[r, k] unit landmarks whose weighted sums come nearer to the places than those of the landmarks given.
 
-    Lists are composed and landmarks moved in turns, to the least squares of what the sums leave over (dictionary
-    learning by the method of optimal directions: Engan, Aase and Husoy 1999). Arguments as of `compose`.
+    Lists are composed and landmarks moved in turns, to the least squares of places less their sums (dictionary learning
+    by the method of optimal directions: Engan, Aase and Husoy 1999). Arguments as of `compose`.
     """
-    some = np.linspace(0, len(places) - 1, min(len(places), _MOST_TAUGHT_BY)).astype(np.intp)
-    places, barred = places[some], None if barred is None else barred[some]
+    sample = np.linspace(0, len(places) - 1, min(len(places), _MOST_TAUGHT_BY)).astype(np.intp)
+    places, barred = places[sample], None if barred is None else barred[sample]
     weights, rows = list_weights(list_length), np.arange(len(places))
     for _ in range(_SWEEPS):
         lists = compose(places, landmarks, list_length, barred)
@@ -278,64 +278,70 @@ def learnt_landmarks(
 def _search(
     products: NDArray[np.float32], gram: NDArray[np.float32], weights: NDArray[np.float32], lists: NDArray[np.uint16]
 ) -> None:
-    """Grow lists from the front, the best few of every length going on: those whose sum is nearest in direction."""
+    """Fill `lists` [n, h] from the front: of every length go on the few whose sum is nearest to the place."""
     n, r = products.shape
     h, width = weights.size, min(_BEAM, r)
-    along, squares = np.empty(width, np.float32), np.empty(width, np.float32)  # of the sum: product with f, square
-    cross = np.empty((width, r), np.float32)  # its products with all landmarks
+    # Of the sum of every partial list: its product with the place, its square, its products with all landmarks.
+    dots, squares = np.empty(width, np.float32), np.empty(width, np.float32)
+    cross = np.empty((width, r), np.float32)
     ids = np.empty((width, h), np.int64)
     best, best_of, best_id = np.empty(width, np.float32), np.empty(width, np.int64), np.empty(width, np.int64)
     scores = np.empty(r, np.float32)
     for i in range(n):
         n_partial = 1
-        along[0], squares[0] = 0.0, 0.0
+        dots[0], squares[0] = 0.0, 0.0
         cross[0] = 0.0
-        for place in range(h):
-            w, n_best = weights[place], 0
+        for depth in range(h):
+            w, n_best = weights[depth], 0
             for b in range(n_partial):
                 for k in range(r):
                     square = squares[b] + w * (2 * cross[b, k] + w)
-                    scores[k] = (along[b] + w * products[i, k]) / np.sqrt(max(square, np.float32(1e-9)))
-                for j in range(place):
+                    scores[k] = (dots[b] + w * products[i, k]) / np.sqrt(max(square, np.float32(1e-9)))
+                for j in range(depth):
                     scores[ids[b, j]] = -np.inf
                 for k in range(r):
                     if scores[k] > -np.inf and (n_best < width or scores[k] > best[width - 1]):
                         n_best = _insert(best, best_of, best_id, n_best, scores[k], b, k)
-            _grow(along, squares, cross, ids, best_of[:n_best], best_id[:n_best], place, w, products[i], gram)
+            _grow(dots, squares, cross, ids, best_of[:n_best], best_id[:n_best], depth, w, products[i], gram)
             n_partial = n_best
-        for place in range(h):
-            lists[i, place] = ids[0, place]
+        for depth in range(h):
+            lists[i, depth] = ids[0, depth]
 
 
 @njit(cache=True, nogil=True)
 def _insert(best: Any, best_of: Any, best_id: Any, n_best: int, score: float, partial: int, landmark: int) -> int:
-    """Into the best so far, in order; ties stay in the order in which they came."""
-    at = min(n_best, best.size - 1)
-    while at > 0 and score > best[at - 1]:
-        best[at], best_of[at], best_id[at] = best[at - 1], best_of[at - 1], best_id[at - 1]
-        at -= 1
-    best[at], best_of[at], best_id[at] = score, partial, landmark
-    longer: int = min(n_best + 1, best.size)
-    return longer
+    """Insert a score into the best so far, in order, ties by arrival; returns how many there are then."""
+    rank = min(n_best, best.size - 1)
+    while rank > 0 and score > best[rank - 1]:
+        best[rank], best_of[rank], best_id[rank] = best[rank - 1], best_of[rank - 1], best_id[rank - 1]
+        rank -= 1
+    best[rank], best_of[rank], best_id[rank] = score, partial, landmark
+    n_longer: int = min(n_best + 1, best.size)
+    return n_longer
 
 
 @njit(cache=True, nogil=True)
 def _grow(
-    along: Any, squares: Any, cross: Any, ids: Any, of: Any, landmark: Any, place: int, w: Any, product: Any, gram: Any
+    dots: Any, squares: Any, cross: Any, ids: Any, base: Any, landmark: Any, depth: int, w: Any, product: Any, gram: Any
 ) -> None:
-    """Partial lists `of`, each one landmark longer, in place of all there were."""
-    longer = of.size
-    along[:longer], squares[:longer], cross[:longer], ids[:longer] = along[of], squares[of], cross[of], ids[of]
-    for b in range(longer):
+    """Replace the partial lists by those at `base`, each one landmark longer."""
+    n_lists = base.size
+    dots[:n_lists], squares[:n_lists], cross[:n_lists], ids[:n_lists] = (
+        dots[base],
+        squares[base],
+        cross[base],
+        ids[base],
+    )
+    for b in range(n_lists):
         k = landmark[b]
-        along[b] += w * product[k]
+        dots[b] += w * product[k]
         squares[b] += w * (2 * cross[b, k] + w)
         cross[b] += w * gram[k]
-        ids[b, place] = k
+        ids[b, depth] = k
 
 
 def lengths_of_sums(lists: NDArray[np.uint16], landmarks: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[n] lengths of the weighted sums of lists [h, n], from the products between landmarks [r, k]."""
+    """[n] float32 lengths of the weighted sums of lists [h, n] of landmarks [r, k]."""
     return _lengths(lists, np.ascontiguousarray(landmarks @ landmarks.T), list_weights(len(lists)))
 
 
@@ -354,5 +360,5 @@ def _lengths(lists: NDArray[np.uint16], gram: NDArray[np.float32], weights: NDAr
 
 
 def is_composed(model: Mapping[str, Any]) -> bool:
-    """Whether a landmark model's prototypes are unit encodings, with what is usual of encodings beside them."""
+    """Whether a landmark model is of `composed` maps: it holds moments of encodings, and prototypes by them."""
     return "usual" in model

@@ -19,7 +19,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule
 
-_LEAST_TOLD = 0.01  # of the mass that a view moves elsewhere; with less it told nothing
+_LEAST_MASS_MOVED = 0.01  # share of the belief; a view that moves less of it elsewhere tells nothing
 _STAGES = ("retrieve", "predict", "update", "plan")
 
 
@@ -28,28 +28,28 @@ class LocalizerConfig:
     """How a robot is localized."""
 
     filter: FilterKind = FilterKind.GRID  # the exact grid or the paper's particles
-    update: UpdateRule | None = None  # how a view counts; None: as the map's relevance wants
+    update: UpdateRule | None = None  # how a view changes the belief; None: as the map's relevance does by default
     planner: str | None = None  # by name; None: the default
-    seed: int = 0  # of whatever is random
+    seed: int = 0  # of every random draw
     n_particles: int = DEFAULT_N_PARTICLES  # of the particle filter
-    price_bits_per_m: float = 0.0  # of moving, to the planner
+    price_bits_per_m: float = 0.0  # what the planner takes a metre of moving to cost
 
 
 @dataclass(frozen=True)
 class LocalizerState:
-    """All that is known of one robot. Immutable: a step makes a new one."""
+    """All that the service knows of one robot. Immutable: a step makes a new one."""
 
     belief: BeliefFilter  # where it is, and whether it is lost
-    live: LiveStatistics | None  # what is usual, from the map's statistics on; None where the relevance asks for none
-    relevance: NDArray[np.float32] | None  # [n] of the last view; None before any
+    live: LiveStatistics | None  # usual views, from the map's statistics on; None where the relevance needs none
+    relevance: NDArray[np.float32] | None  # [n] of the last view; None before the first
     n_observations: int  # views so far
 
 
 @dataclass(frozen=True)
 class Step:
-    """What one observation came to."""
+    """The outcome of one observation."""
 
-    state: LocalizerState  # the state after it
+    state: LocalizerState  # after the observation
     plan: Plan | None  # the recommended next move; None where the planner has nothing to go by
     is_informative: bool  # whether the view changed the belief, or would have changed one that was less sure
     timings_ms: dict[str, float]  # milliseconds by stage
@@ -70,51 +70,52 @@ class ActiveLocalizer:
         self._planner = parse_planner(config.planner or DEFAULT_PLANNER, map_.actions_m.tolist())
 
     def start(self, position_m: float | None = None, std_m: float = 5.0) -> LocalizerState:
-        """Before any view: around a position, or anywhere on the route."""
+        """The state before any view: a belief around a position, or over the whole route."""
         return LocalizerState(self._prior(position_m, std_m), self._map.live_statistics, None, 0)
 
     def step(
         self, state: LocalizerState, query: Query, action_m: float = 0.0, action_std_m: float | None = None
     ) -> Step:
-        """One observation.
+        """One observation: the move that led to it, then the view.
 
         Args:
-            action_m: Metres moved since the last view; ignored for the first. Backward within its error is no move
-                where the domain's actions go forward alone.
-            action_std_m: How sure that is; None: as odometry usually is.
+            action_m: Metres moved since the last view; ignored for the first. Where the domain's actions only go
+                forward, a move backward within its error counts as none.
+            action_std_m: Standard deviation of the move; None: that of usual odometry.
 
         Raises:
             PastTheEndError: The move leads past the end of an open route wherever the robot may have been.
             InvalidInputError: The view lacks what the map's relevance compares.
         """
-        laps = [self._clock()]
-        map_, number = self._map, state.n_observations
+        times_s = [self._clock()]
+        map_, step = self._map, state.n_observations
         std_m = action_std_m if action_std_m is not None else motion_std_m(action_m) if action_m != 0 else 0.0
-        jitters = not map_.goes_backward and -SIGMAS * std_m <= action_m < 0
-        moved_m = 0.0 if number == 0 or jitters else action_m
+        is_jitter = not map_.goes_backward and -SIGMAS * std_m <= action_m < 0
+        moved_m = 0.0 if step == 0 or is_jitter else action_m
 
-        live, is_strange = map_.after_view(state.live, query, moved_m if number > 0 else None)
+        live, is_strange = map_.after_view(state.live, query, moved_m if step > 0 else None)
         relevance = relevances(map_, query, live)
-        laps.append(self._clock())
+        times_s.append(self._clock())
 
-        belief = state.belief.predicted(moved_m, std_m, number) if number > 0 else state.belief
-        laps.append(self._clock())
+        belief = state.belief.predicted(moved_m, std_m, step) if step > 0 else state.belief
+        times_s.append(self._clock())
 
-        told = 0.0
+        mass_moved = 0.0
         if query.is_informative and not is_strange:
-            shared = map_.shared_error_after(moved_m) if number > 0 else 0.0
-            seen = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared)
-            belief = belief.updated(seen, number)
-            told = belief.mass_moved
-        laps.append(self._clock())
+            shared_error = map_.shared_error_after(moved_m) if step > 0 else 0.0
+            evidence = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared_error)
+            belief = belief.updated(evidence, step)
+            mass_moved = belief.mass_moved
+        times_s.append(self._clock())
 
-        after = LocalizerState(belief, live, relevance, number + 1)
-        plan = self.plan(after)
-        laps.append(self._clock())
-        return Step(after, plan, told > _LEAST_TOLD, dict(zip(_STAGES, (1000 * np.diff(laps)).tolist(), strict=True)))
+        new_state = LocalizerState(belief, live, relevance, step + 1)
+        plan = self.plan(new_state)
+        times_s.append(self._clock())
+        timings_ms = dict(zip(_STAGES, (1000 * np.diff(times_s)).tolist(), strict=True))
+        return Step(new_state, plan, mass_moved > _LEAST_MASS_MOVED, timings_ms)
 
     def plan(self, state: LocalizerState) -> Plan | None:
-        """The next best view from what is known now."""
+        """The move to the next best view from this state."""
         return self._planner(
             PlanningView(
                 self._map,
@@ -127,13 +128,13 @@ class ActiveLocalizer:
         )
 
     def with_prior(self, state: LocalizerState, position_m: float, std_m: float) -> LocalizerState:
-        """The robot was carried, or got a fix: a new belief; what is usual for each landmark stays."""
+        """A robot was carried or got a fix: the state with a new belief around a position, and the same statistics."""
         return replace(state, belief=self._prior(position_m, std_m))
 
     def to_arrays(self, state: LocalizerState) -> dict[str, NDArray[np.generic]]:
-        """All of a state, to be restored bit for bit."""
-        arrays: dict[str, NDArray[np.generic]] = {f"belief_{name}": a for name, a in state.belief.arrays().items()}
-        arrays["n_observations"] = np.array([state.n_observations])
+        """The named arrays of a state, from which `from_arrays` restores it bit for bit."""
+        arrays: dict[str, NDArray[np.generic]] = {"n_observations": np.array([state.n_observations])}
+        arrays |= {f"belief_{name}": array for name, array in state.belief.arrays().items()}
         if state.live is not None:
             arrays |= {f"live_{name}": array for name, array in state.live.to_arrays().items()}
         if state.relevance is not None:
@@ -141,16 +142,16 @@ class ActiveLocalizer:
         return arrays
 
     def from_arrays(self, arrays: dict[str, NDArray[np.generic]]) -> LocalizerState:
-        """Restore what `to_arrays` gave; raises KeyError where an array is missing."""
-        held = _of("belief_", arrays)
+        """The state whose arrays `to_arrays` gave; raises KeyError where one is missing."""
+        belief_arrays = _with_prefix("belief_", arrays)
         belief: BeliefFilter
         if self._config.filter is FilterKind.GRID:
-            belief = GridFilter.from_arrays(self._map.route, held)
+            belief = GridFilter.from_arrays(self._map.route, belief_arrays)
         else:
-            belief = ParticleFilter.from_arrays(self._map.route, held, self._config.seed)
+            belief = ParticleFilter.from_arrays(self._map.route, belief_arrays, self._config.seed)
         live = self._map.live_statistics
         if live is not None:
-            live = live.from_arrays(_of("live_", arrays))
+            live = live.from_arrays(_with_prefix("live_", arrays))
         relevance = np.asarray(arrays["relevance"], np.float32) if "relevance" in arrays else None
         return LocalizerState(belief, live, relevance, int(arrays["n_observations"][0]))
 
@@ -165,7 +166,7 @@ class ActiveLocalizer:
         return ParticleFilter.around(route, position_m, std_m, config.n_particles, config.seed, rule)
 
 
-def _of(prefix: str, arrays: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float64]]:
+def _with_prefix(prefix: str, arrays: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float64]]:
     return {
         name.removeprefix(prefix): np.asarray(array, np.float64)
         for name, array in arrays.items()

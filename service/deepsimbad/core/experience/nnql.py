@@ -33,18 +33,18 @@ class NnqlConfig:
     discount: float = 0.9  # gamma
     initial_q: float = 1e-4  # what an entry holds before anything is learnt
     reward: float = 100.0  # for a belief that places the truth well
-    # Share of the map images among which the true viewpoint's belief must rank to earn the reward
+    # Share of the map images; the true viewpoint's belief must rank among the best so many to earn the reward.
     top_share: float = 0.10
     n_neighbours: int = 4  # k, map images that stand for one view
     # Epsilon at the first episode: how often a move is drawn at random. Not given in the paper.
     exploration: float = 1.0
     final_exploration: float = 0.1  # epsilon at the last episode; between the two it falls in a straight line
     update: UpdateRule | None = None  # how a view changes the belief; None: as the map's relevance does by default
-    motion_std_m: float | None = None  # standard deviation of a move; None: `filters.motion_std_m`
+    motion_std_m: float | None = None  # standard deviation of a move; None: `motion_std_m` of it
     # Episodes that move in lockstep: each step acts on the same Q-values, then learns from all of them in their order.
-    # It decides speed, and hardly the result.
+    # More are faster, and hardly change the result.
     batch_episodes: int = 100
-    seed: int = 0  # of every draw
+    seed: int = 0  # of every random draw
 
     def __post_init__(self) -> None:
         counts = (self.n_actions_per_episode, self.n_neighbours, self.batch_episodes)
@@ -58,35 +58,35 @@ class NnqlConfig:
             raise InvalidMapConfigError("NNQL's reward, first value and motion deviation must be finite numbers")
 
     def exploration_at(self, episode: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Epsilon of episodes, counted from 0."""
-        done = episode / max(self.n_episodes - 1, 1)
-        return self.exploration + (self.final_exploration - self.exploration) * done
+        """[e] epsilon of episodes [e], counted from 0."""
+        progress = episode / max(self.n_episodes - 1, 1)
+        return self.exploration + (self.final_exploration - self.exploration) * progress
 
 
 class Transitions(NamedTuple):
     """Moves whose outcome is known, in the order they are learnt."""
 
     nearest: NDArray[np.int64]  # [t, k] int64, map images most relevant to the view before the move
-    action: NDArray[np.int64]  # [t] int64, place of the move among the domain's actions
+    action: NDArray[np.int64]  # [t] int64, index of the move among the domain's actions
     reward: NDArray[np.float64]  # [t] float64
     next_nearest: NDArray[np.int64]  # [t, k] int64, of the view after the move
-    next_allowed: NDArray[np.bool_]  # [t, a] bool, the moves that are possible from there; none: the route ends
+    next_allowed: NDArray[np.bool_]  # [t, a] bool, the moves that the route allows from there; none where it ends
 
 
 def initial_q_values(n_images: int, n_actions: int, config: NnqlConfig) -> NDArray[np.float32]:
-    """An experience database [n, a] that knows nothing."""
+    """[n, a] float32, an experience database that has learnt nothing."""
     return np.full((n_images, n_actions), config.initial_q, np.float32)
 
 
 def q_of_nearest(q_values: NDArray[np.float32], nearest: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The values [t, a] of views whose nearest map images [t, k] are known."""
+    """[t, a] the values of views, from their nearest map images [t, k]."""
     return np.asarray(q_values[nearest].mean(axis=1, dtype=np.float64))
 
 
 def learn(q_values: NDArray[np.float32], moves: Transitions, config: NnqlConfig) -> None:
     """Q-learning, in place, one transition after the other.
 
-    Each of the k entries moves by alpha towards `R + gamma max_a' Q(s', a')`.
+    Each of the k entries of a transition moves by alpha towards `R + gamma max_a' Q(s', a')`.
     """
     _learn(q_values, *moves, config.learning_rate, config.discount)
 
@@ -114,16 +114,16 @@ def _learn(
             best = max(best, total / k)
         target = reward[t] + (discount * best if best > -np.inf else 0.0)
         for j in range(k):
-            old = q_values[nearest[t, j], action[t]]
-            q_values[nearest[t, j], action[t]] = old + learning_rate * (target - old)
+            q_value = q_values[nearest[t, j], action[t]]
+            q_values[nearest[t, j], action[t]] = q_value + learning_rate * (target - q_value)
 
 
 @dataclass(frozen=True)
 class KnownWalk:
     """A session's views and moves, and where they truly were."""
 
-    queries: Sequence[Query]  # the t described views, in order
-    action_m: NDArray[np.float64]  # [t] metres moved before every view; the first is not read
+    queries: Sequence[Query]  # the t described views, in order of time
+    action_m: NDArray[np.float64]  # [t] metres moved before every view; the first is ignored
     true_position_m: NDArray[np.float64]  # [t] route positions; NaN where unknown
 
     def __post_init__(self) -> None:
@@ -138,11 +138,11 @@ class KnownWalk:
 def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transitions:
     """Replay a walk from a uniform belief, and reward its moves as training does.
 
-    A move counts for the domain's action nearest to it, if that is nearer than half the step between two actions (of
-    one action alone, than half of it). Other moves, and those to an unknown place, teach nothing.
+    A move counts for the domain's action nearest to it, if that is no farther than half the least step between two
+    actions (of a single action, than half of it). Other moves, and those to an unknown place, teach nothing.
     """
-    moves, route = map_.actions_m, map_.route
-    reach_m = np.diff(moves).min() / 2 if moves.size > 1 else abs(moves[0]) / 2
+    actions_m, route = map_.actions_m, map_.route
+    reach_m = np.diff(actions_m).min() / 2 if actions_m.size > 1 else abs(actions_m[0]) / 2
     rule = config.update or map_.update_rule
     belief, live = GridFilter.uniform(route, rule), map_.live_statistics
     nearest: list[NDArray[np.int64]] = []
@@ -157,20 +157,20 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
                 belief = GridFilter.uniform(route, rule)
         live = None if live is None else live.observing(query)
         relevance = relevances(map_, query, live)
-        shared = map_.shared_error_after(float(walk.action_m[t])) if t > 0 else 0.0
-        belief = belief.updated(ViewEvidence.of(relevance, rule, map_.log_likelihood_scale, shared), t)
+        shared_error = map_.shared_error_after(float(walk.action_m[t])) if t > 0 else 0.0
+        belief = belief.updated(ViewEvidence.of(relevance, rule, map_.log_likelihood_scale, shared_error), t)
         nearest.append(shortlist(relevance, config.n_neighbours))
         if t == 0 or np.isnan(walk.true_position_m[t]):
             continue
-        action = int(np.abs(moves - walk.action_m[t]).argmin())
-        if abs(moves[action] - walk.action_m[t]) <= reach_m:
+        action = int(np.abs(actions_m - walk.action_m[t]).argmin())
+        if abs(actions_m[action] - walk.action_m[t]) <= reach_m:
             truth = route.nearest_image(walk.true_position_m[[t]]).astype(np.int64)
-            earned = rank_of_truth(belief.mass, truth) < config.top_share * route.n_images
-            rewarded.append((t, action, config.reward * earned))
+            is_earned = rank_of_truth(belief.mass, truth) < config.top_share * route.n_images
+            rewarded.append((t, action, config.reward * is_earned))
     views = np.array([view for view, _, _ in rewarded], np.int64)
     k = min(config.n_neighbours, route.n_images)
     rows = np.array(nearest, np.int64).reshape(-1, k)
-    ahead_m = walk.true_position_m[views][:, np.newaxis] + moves
+    ahead_m = walk.true_position_m[views][:, np.newaxis] + actions_m
     return Transitions(
         nearest=rows[views - 1],
         action=np.array([action for _, action, _ in rewarded], np.int64),
