@@ -12,18 +12,18 @@ _LEVELS = (2.5, 97.5)
 
 @dataclass(frozen=True)
 class RetrievalScores:
-    """What a set of queries scored."""
+    """The scores of a set of queries."""
 
     anr: float  # averaged normalised rank in percent; 0 is perfect, 50 chance
     recall_at: dict[int, float]  # R@k in percent by k
     n_queries: int  # queries scored
     n_left_out: int  # queries without a true image among the map's
-    # [n_queries] share of map images placed before the truth, 0..1, in query order
+    # [n_queries] share of map images ranked before the truth, 0..1, in query order
     normalised_ranks: NDArray[np.float64]
 
 
 def rank_of_truth(relevance: NDArray[np.floating], true_images: NDArray[np.int64]) -> float:
-    """Rank, counted from 0, of the best-placed of at least one true image: images better plus half the others tied."""
+    """Rank, from 0, of the best of at least one true image: the number of better images plus half the others tied."""
     best = relevance[true_images].max()
     n_better = np.count_nonzero(relevance > best)
     n_tied = np.count_nonzero(relevance == best)
@@ -65,7 +65,7 @@ class RetrievalScorer:
 def mean_interval(
     values: NDArray[np.float64], seed: int, block: NDArray[np.int64] | None = None
 ) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean of [n] values; of neighbours that are alike by their blocks [n]."""
+    """95 % bootstrap interval of the mean of values [n]; drawn by blocks [n] where neighbouring values are alike."""
     rng = np.random.default_rng([seed, values.size])
     if block is None:
         block = np.arange(values.size)

@@ -1,4 +1,4 @@
-"""What a view says of places, and how far it is to be trusted; of both filters.
+"""What a view says of places and how far it is to be trusted, for both filters.
 
 The robot is somewhere on the route or lost: off it, or anywhere on it after having been carried. How well the believed
 places explain a view, against the map on the whole, decides between the two.
@@ -6,7 +6,7 @@ places explain a view, against the map on the whole, decides between the two.
 Views err alike where they are near each other, so a view counts by what it says beyond the one before, carried along by
 the move; this is generalised least squares for errors that are autoregressive along the route. And how far this season
 can be trusted nobody knows before: the belief is a mixture of three, which trust a view half, once and twice as much as
-was learnt, weighed by how well each has predicted the views so far (`mixture`, ours). The paper's updates have one.
+the map learnt, weighed by how well each has predicted the views so far (`mixture`, ours). The paper's updates have one.
 """
 
 from dataclasses import dataclass
@@ -25,14 +25,14 @@ TRUSTS = (0.5, 1.0, 2.0)
 """How much of the learnt log-likelihood each part of a mixture believes; each twice the one before."""
 
 PRIOR_TRUST = (0.2, 0.4, 0.4)
-"""How probable each is before anything was seen: few seasons are as bad as the least trust takes them for."""
+"""How probable each trust is before any view: few seasons are as bad as the least takes them for."""
 
 TRUSTS_OF = {rule: TRUSTS if rule is UpdateRule.MIXTURE else (1.0,) for rule in UpdateRule}
 
 LEAST_ALLOWED = 1e-12
-"""How likely a view is at places that it excludes, against the map on the whole: a belief always holds some."""
+"""How likely a view is at places that it excludes, relative to the map on average: no belief loses all its mass."""
 
-LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # before anything was seen: anywhere, and where somebody said it is
+LOST_AT_START, LOST_AT_FIX = 0.02, 0.005  # probability before any view: of a robot anywhere, and after a fix
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,13 @@ class ViewEvidence:
     """What one view says of every map image."""
 
     rule: UpdateRule
-    values: NDArray[np.float64]  # [n]; log-likelihoods but for a constant, mean 0, or what additive rules add
-    shared: float = 0.0  # c', how much of its error is that of the view before; of a first view nothing
+    # [n] log-likelihoods but for a constant, of mean 0; or the weights that additive rules add
+    values: NDArray[np.float64]
+    shared: float = 0.0  # c', share of its error that is that of the view before; 0 of a first view
 
     @classmethod
     def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared: float = 0.0) -> Self:
-        """Of a view's relevance [n], which counts `scale` times as a log-likelihood."""
+        """From a view's relevance [n], which times `scale` is a log-likelihood."""
         if rule is UpdateRule.ADDITIVE_RELEVANCE:
             return cls(rule, np.maximum(relevance, 0).astype(np.float64))
         if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
@@ -55,14 +56,15 @@ class ViewEvidence:
     def likelihood(
         self, values: NDArray[np.float64], last: NDArray[np.float64] | None
     ) -> tuple[NDArray[np.float64], float]:
-        """What its values, of map images or at cells [m], say beyond the last view's, carried along.
+        """How likely the view is, by what its values [m] say beyond the last view's.
 
         Args:
-            last: None: there was none.
+            values: Its values, of map images or at cells.
+            last: Those of the last view [m], carried along by the move; None where there was none.
 
         Returns:
-            [m] of the least trust, the greatest 1: whatever the relevances are, none overflows. And the mass that it
-            would at least have moved elsewhere where nothing was known, when that is small.
+            [m] likelihoods by the least trust, the greatest 1, so that none overflows; and the share of a belief that
+            knew nothing which they would have moved elsewhere, as far as it is small.
         """
         trust = TRUSTS_OF[self.rule][0]
         exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared)), trust)
@@ -70,13 +72,13 @@ class ViewEvidence:
 
     @property
     def is_added(self) -> bool:
-        """Whether it is added to weights, as in the paper, and does not multiply them."""
+        """Whether its values are added to weights, as in the paper, rather than multiply them as likelihoods."""
         return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float64]:
-    """[n] so many times what a relevance is above its mean."""
+    """[n] `scale` times the relevance less its mean."""
     total = 0.0
     for i in range(relevance.size):
         total += relevance[i]
@@ -90,15 +92,15 @@ def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float64
 def _news(
     values: NDArray[np.float64], last: NDArray[np.float64], shared: float, trust: float
 ) -> tuple[NDArray[np.float64], float]:
-    """What values [m] say beyond the last ones, of whose error they share so much.
+    """What values [m] say beyond the last ones [m], of whose error theirs contains the share `shared`.
 
     Returns:
-        [m] `trust` times that, less the greatest of them; and its mean size.
+        [m] `trust` times that, shifted so that the greatest is 0; and the mean size of it without trust and shift.
     """
-    news, size, times = np.empty(values.size), 0.0, trust / (1 + shared)
-    greatest = times * (values[0] - shared * last[0])
+    news, size, factor = np.empty(values.size), 0.0, trust / (1 + shared)
+    greatest = factor * (values[0] - shared * last[0])
     for i in range(values.size):
-        news[i] = times * (values[i] - shared * last[i])
+        news[i] = factor * (values[i] - shared * last[i])
         size += abs(news[i])
     for i in range(values.size):
         greatest = max(greatest, news[i])
@@ -113,11 +115,11 @@ class Doubt:
 
     lost: NDArray[np.float64]  # [t] by trust, of what that trust believes
     log_trust: NDArray[np.float64]  # [t] how well each has predicted the views so far
-    last: NDArray[np.float64] | None = None  # [n] values of the last view, where the robot would have seen them
+    last: NDArray[np.float64] | None = None  # [n] values of the last view, carried along by the moves since
 
     @classmethod
     def at_start(cls, rule: UpdateRule, lost: float) -> Self:
-        """Before any view, lost with this probability."""
+        """The doubt before any view, of a robot that is lost with this probability."""
         n = len(TRUSTS_OF[rule])
         return cls(np.full(n, lost), np.log(PRIOR_TRUST) if n > 1 else np.zeros(n))
 
@@ -128,7 +130,7 @@ class Doubt:
 
     @cached_property
     def trust(self) -> NDArray[np.float64]:
-        """[t] sums to 1."""
+        """[t] probability of each trust; sums to 1."""
         weight = np.exp(self.log_trust - self.log_trust.max())
         return np.asarray(weight / weight.sum())
 
@@ -138,18 +140,18 @@ class Doubt:
         return float(self.trust @ self.lost)
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All state."""
+        """The named arrays from which `from_arrays` restores it."""
         arrays = {"lost": self.lost, "log_trust": self.log_trust}
         return arrays if self.last is None else {**arrays, "last": self.last}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
-        """Restore what `arrays` gave."""
+        """The doubt whose arrays `arrays` gave."""
         return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
 
 
 def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:
-    """[n] values of map images, where a robot that moves sees them next; what lies before an open route is 0."""
+    """[n] values of map images carried along by a move: each gets that of the place `action_m` behind it, or 0."""
     if action_m == 0 or route.length_m == 0:
         return values
     from_m = route.wrapped(route.position_m - action_m)
@@ -158,11 +160,11 @@ def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> N
     return np.interp(from_m, route.position_m, values, left=0.0, right=0.0)
 
 
-def added(mass: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Masses [m], summing to 1, after evidence that is added, as the paper adds `v[u_k]` to its particles' weights.
+def added(mass: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Masses [m], summing to 1, after values [m] are added, as the paper adds `v[u_k]` to its particles' weights.
 
-    Weights are taken with mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1,
-    however many there are.
+    Weights have mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1, however many
+    there are.
     """
-    weights = mass * mass.size + seen
+    weights = mass * mass.size + values
     return np.asarray(weights / weights.sum(), np.float64)

@@ -1,6 +1,6 @@
-"""What a move does to a belief, of both filters: how far it errs, where it may end, and who is lost on the way.
+"""What a move does to a belief, for both filters: its error, where it may end, and who is lost on the way.
 
-Being lost is entered at a small rate a metre and left to anywhere. A move ends where an open route ends, within its
+A robot gets lost at a small rate a metre, and is then found anywhere. A move ends where an open route ends, within its
 error; only one whose whole error lies past the end is refused.
 """
 
@@ -13,14 +13,14 @@ from deepsimbad.core.belief.evidence import Doubt
 from deepsimbad.core.route import Route
 from deepsimbad.errors import PastTheEndError
 
-LOST_A_METRE = 0.0005
-FOUND_A_VIEW = 0.02  # of what is lost, spread over the route when the robot has moved
-LEAST_SURVIVING_SHARE = 1e-9  # of a belief before a move; with less it leads past the end wherever the robot may be
-_DOUBTING = 0.01  # a belief that takes the robot for lost by more refuses no move
-SIGMAS = 4.0  # a move's error is cut off here
-_AS_TOLD = 0.6  # of moves: how many err by no more than odometry says of itself
-_SLIPPING = 0.2  # of a move: how far off the others are, for a wheel slips or its size is not what it was
-_NARROW = 0.6  # cells; a narrower normal curve is not sampled, but has its variance all the same
+LOST_A_METRE = 0.0005  # probability of getting lost
+FOUND_A_VIEW = 0.02  # share of the lost mass that a move spreads over the route
+LEAST_SURVIVING_SHARE = 1e-9  # of a belief; a move that leaves less leads past the end wherever the robot may be
+_DOUBTING = 0.01  # probability of being lost; a belief that has more refuses no move
+SIGMAS = 4.0  # standard deviations at which a move's error is cut off
+_EXACT_SHARE = 0.6  # of moves, whose error is no more than odometry says
+_SLIP_SHARE = 0.2  # of a move's length, by which the others err: a wheel slips, or its size has changed
+_NARROW = 0.6  # cells; of a narrower normal curve three weights with its variance stand in for samples
 
 
 def motion_std_m(action_m: float) -> float:
@@ -32,14 +32,14 @@ def motion_std_m(action_m: float) -> float:
 
 
 def move_stds_m(action_m: float, action_std_m: float, doubt: Doubt) -> dict[float, float]:
-    """Deviations of a move by how probable each is: a mixture takes some to be farther off than told.
+    """{probability: standard deviation} of a move: a mixture takes some to err by more than odometry says.
 
-    Where odometry says of itself that it is more exact than usual, its moves slip less by as much.
+    Where odometry says that it is more exact than usual, its moves slip less in proportion.
     """
     if not doubt.is_mixture:
         return {1.0: action_std_m}
-    slip_m = _SLIPPING * action_m * min(1.0, action_std_m / motion_std_m(action_m))
-    return {_AS_TOLD: action_std_m, 1 - _AS_TOLD: float(np.hypot(action_std_m, slip_m))}
+    slip_m = _SLIP_SHARE * action_m * min(1.0, action_std_m / motion_std_m(action_m))
+    return {_EXACT_SHARE: action_std_m, 1 - _EXACT_SHARE: float(np.hypot(action_std_m, slip_m))}
 
 
 def check_ahead(
@@ -63,20 +63,20 @@ def leaving_and_found(
     surviving: NDArray[np.float64],
     action_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """What is lost after a move, by what the masses that survived it are multiplied, and what is found anywhere; [t].
+    """[t], [t], [t] after a move: the lost mass, the factor of the masses that survived, and what is found anywhere.
 
-    To the paper's updates a move past the end is impossible, and nobody is lost on the way.
+    In the paper's updates a move past the end is impossible, and nobody is lost on the way.
     """
     if not doubt.is_mixture:
         return lost, on_route / surviving, np.zeros_like(lost)
     lost = lost + on_route - surviving
-    found = FOUND_A_VIEW * lost if action_m != 0 else np.zeros_like(lost)
+    found_mass = FOUND_A_VIEW * lost if action_m != 0 else np.zeros_like(lost)
     leaving = 1 - np.exp(-LOST_A_METRE * abs(action_m))
-    return lost - found + leaving * surviving, np.full(lost.size, 1 - leaving), found
+    return lost - found_mass + leaving * surviving, np.full(lost.size, 1 - leaving), found_mass
 
 
 def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]:
-    """[2 w + 1] a move's normal error, from w cells of `step_m` behind to w ahead."""
+    """[2 w + 1] weights of a move's normal error, from w cells of `step_m` behind to w ahead."""
     deviation = std_m / step_m
     if deviation < _NARROW:
         half = deviation**2 / 2 if n_cells > 1 else 0.0
@@ -88,7 +88,7 @@ def move_error(step_m: float, n_cells: int, std_m: float) -> NDArray[np.float64]
 
 @lru_cache(maxsize=64)  # robots make the same moves again and again
 def mixed_error(step_m: float, n_cells: int, *stds_m: tuple[float, float]) -> NDArray[np.float64]:
-    """[2 w + 1] as `move_error`, of deviations after how probable each is; not to be written to."""
+    """[2 w + 1] `move_error` averaged over (probability, deviation) pairs `stds_m`; shared, so not to be written to."""
     errors = [share * move_error(step_m, n_cells, std_m) for share, std_m in stds_m]
     widest = max(error.size for error in errors)
     return np.asarray(np.sum([np.pad(error, (widest - error.size) // 2) for error in errors], axis=0), np.float64)
