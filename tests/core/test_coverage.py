@@ -19,7 +19,7 @@ def mapped(rng, first, stop):
     places[first:stop] = places[first]
     drive = Drive(position_m=2.0 * np.arange(N), encodings=seen(rng, places))
     built = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0,)), drive, None, None, 60)
-    return places, built.map, built.own
+    return places, built.map, built.map_drive
 
 
 def seen(rng, places):

@@ -37,7 +37,7 @@ def trained(relevance=Relevance.RRF, second=None, own=None, config=None, on_prog
     own, actions_m, config = own or drives()[0], (1.0, 2.0, 5.0), config or NnqlConfig(n_episodes=200)
     if relevance is Relevance.COMPOSED:
         built = compose_map(MapPlan(relevance, 4, actions_m, same_route=True), own, second, second, R)
-        return train_nnql(built.rehearsal, built.own, built.second, config, on_progress)
+        return train_nnql(built.rehearsal, built.map_drive, built.second, config, on_progress)
     map_ = replace(build_map(relevance, own, 4), actions_m=np.array(actions_m))
     return train_nnql(map_, own, second, config, on_progress)
 

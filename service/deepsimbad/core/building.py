@@ -33,19 +33,19 @@ from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError
 
 _OWN_PLACE_M = 2.0  # a landmark from no farther away is a place's own
-_SPREAD_OVER = 0.5  # of the route, at least, that places seen twice must cover before they tell of all of it
+_SPREAD_OVER = 0.5  # share of the route that places seen in two seasons must at least span to tell of all of it
 Measure = Callable[[Drive, Mapping[str, NDArray[Any]]], Drive]
 
 
 @dataclass(frozen=True)
 class MapPlan:
-    """What a map is to be, and what it is made of."""
+    """What a map is to be, and how it may be made."""
 
     relevance: Relevance
     list_length: int  # h
     actions_m: tuple[float, ...]
     closed: bool = False
-    # Whether the drives' positions are said to be comparable; None: where both know x, y
+    # Whether the drives' positions are comparable; None: they are where both know x, y
     same_route: bool | None = None
     bars_own_place: bool = False  # no image lists a landmark that was seen from its own place (`composed`)
 
@@ -56,14 +56,14 @@ class Built:
 
     map: Map  # as it will serve, but for its experience database
     rehearsal: Map  # the map made without the second season's lists, for learning from that season as from one to come
-    own: Drive  # the training traverse, measured
-    second: Drive | None = None  # the second drive, measured, where it is of the same route
+    map_drive: Drive  # the training traverse, measured
+    second: Drive | None = None  # the second drive, measured; None where none is of the same route
     same_route: SameRoute | None = None  # whether it is, and why not; None where there is no second drive
     places: NDArray[np.float32] | None = None  # [n, k] unit vectors that the lists stand for (`composed`)
-    chosen: NDArray[np.float32] | None = None  # [r, k] landmarks before they moved to where sums of them are nearest
+    initial_landmarks: NDArray[np.float32] | None = None  # [r, k] before they moved to where their sums are nearer
     by_camera: bool = False  # whether what a season changes was learnt on another route
-    fitting: Mapping[str, Any] | None = None  # how the evaluator was fitted, JSON-ready; None: it was not, here
-    warnings: tuple[str, ...] = ()  # of fitting
+    fitting: Mapping[str, Any] | None = None  # how the evaluator was fitted, JSON-ready; None where it was not
+    warnings: tuple[str, ...] = ()  # of the fitting
 
 
 def build_from_dissimilarities(
@@ -74,7 +74,7 @@ def build_from_dissimilarities(
     measure: Measure,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Built:
-    """Describe every training frame by landmarks that are chosen, and learn from a second season where there is one.
+    """A map of any relevance but `composed`, by an evaluator's landmarks; it learns from a second season if it can.
 
     Args:
         second: Another drive, perhaps of the same route.
@@ -85,28 +85,28 @@ def build_from_dissimilarities(
         InvalidMapConfigError: No image, or h not within 1..r.
         InvalidRouteError: The positions go backwards or are NaN.
     """
-    own = measure(training, model)
+    map_drive = measure(training, model)
     on_progress(0.4)
     season = verdict = None
     other: Drive | None = None
     if second is not None:
         season, other, verdict = second_season(
-            own, plan.closed, second, plan.same_route, lambda drive: measure(drive, model)
+            map_drive, plan.closed, second, plan.same_route, lambda drive: measure(drive, model)
         )
     on_progress(0.7)
-    map_ = build_map(plan.relevance, own, plan.list_length, plan.closed)
+    map_ = build_map(plan.relevance, map_drive, plan.list_length, plan.closed)
     map_ = replace(map_, landmark_model=model, actions_m=np.array(sorted(plan.actions_m)))
-    dissimilarities = measured_dissimilarities(own)
+    dissimilarities = measured_dissimilarities(map_drive)
     if plan.relevance is Relevance.STANDARDISED:
         map_ = replace(map_, **rehearsed(map_, dissimilarities, season))
-    told = own_views(map_, dissimilarities)
+    views = own_views(map_, dissimilarities)
     if plan.relevance is Relevance.STANDARDISED:
-        map_ = replace(map_, view_bits=view_bits(map_, told, map_, season))
+        map_ = replace(map_, view_bits=view_bits(map_, views, map_, season))
     if season is not None and other is not None and plan.relevance is Relevance.BRUTE_FORCE:
         season = replace(season, encodings=other.encodings)
-    map_ = replace(map_, coverage=placed_rightly(map_, told, season))
+    map_ = replace(map_, coverage=placed_rightly(map_, views, season))
     on_progress(1.0)
-    return Built(map_, map_, own, other, verdict)
+    return Built(map_, map_, map_drive, other, verdict)
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,12 @@ class SeenTwice:
 
 @dataclass(frozen=True)
 class _Space:
-    """Where unit encodings are compared, and the landmarks there."""
+    """The space in which unit encodings are compared, and its landmarks."""
 
     projection: NDArray[np.float32] | None  # [d, k]
     prototypes: NDArray[np.float32]  # [r, k]
-    chosen: NDArray[np.int64] | None = None  # [r] which candidates they were; None: they stay those of another map
+    # [r] frames of the candidates that the landmarks are; None where they are another map's
+    candidate_frames: NDArray[np.int64] | None = None
 
     @classmethod
     def first(
@@ -135,7 +136,7 @@ class _Space:
         halves: Sequence[int],
         on_progress: Callable[[float], None],
     ) -> Self:
-        """Before seasons are known: with landmarks chosen from a drive, or those of another map's model."""
+        """The space before seasons are known, with landmarks chosen from a drive or those of another map's model."""
         if isinstance(candidates, Drive):
             drives = {id(drive): drive.encodings for drive in (training, candidates)}
             directions = principal_directions(*drives.values(), halves=halves, on_progress=on_progress)
@@ -148,30 +149,30 @@ class _Space:
 
     @classmethod
     def among(cls, candidates: Drive, projection: NDArray[np.float32] | None, n_landmarks: int) -> Self:
-        """With landmarks chosen from a drive."""
+        """The space of a projection, with landmarks chosen from a drive."""
         u = _unit_vectors(candidates, projection)
-        chosen = farthest_first(u, n_landmarks)
-        return cls(projection, u[chosen], chosen)
+        frames = farthest_first(u, n_landmarks)
+        return cls(projection, u[frames], frames)
 
     def fitted(self, places: NDArray[np.float32], list_length: int, barred: NDArray[np.bool_] | None) -> Self:
-        """Landmarks moved to where sums of them come nearer to places [n, k]."""
+        """The same space with landmarks moved to where sums of them come nearer to places [n, k]."""
         return replace(self, prototypes=learnt_landmarks(places, self.prototypes, list_length, barred))
 
     def described_in(self, map_: Map, places: NDArray[np.float32], barred: NDArray[np.bool_] | None) -> Map:
-        """The map with lists of other places [n, k], and of these landmarks."""
+        """The map with lists of other places [n, k], by the landmarks of this space."""
         lists = compose(places, self.prototypes, map_.list_length, barred)
         return replace(map_, lists=lists, landmark_model={**map_.landmark_model, "prototypes": self.prototypes})
 
-    def model(self, usual: Moments) -> dict[str, NDArray[Any]]:
-        """As a robot needs it: the landmarks, and what makes an encoding a unit vector."""
-        arrays: dict[str, NDArray[Any]] = {"prototypes": self.prototypes, "usual": usual.mean_std()}
+    def model(self, moments: Moments) -> dict[str, NDArray[Any]]:
+        """The landmark model that robots get: the landmarks, and what makes an encoding a unit vector."""
+        arrays: dict[str, NDArray[Any]] = {"prototypes": self.prototypes, "usual": moments.mean_std()}
         return arrays if self.projection is None else {**arrays, "projection": self.projection}
 
     def unit_vectors(self, drive: Drive) -> NDArray[np.float32]:
-        """[n, k] of a drive's frames, by its own statistics."""
+        """[n, k] unit vectors of a drive's frames, by its own statistics."""
         return _unit_vectors(drive, self.projection)
 
-    def seen(self, drive: Drive) -> Drive:
+    def measured(self, drive: Drive) -> Drive:
         """The drive with its dissimilarities: squared distances between unit vectors."""
         return replace(drive, dissimilarities=self.dissimilarities(self.unit_vectors(drive)))
 
@@ -180,9 +181,9 @@ class _Space:
         return np.asarray(np.clip(2 - 2 * (u @ self.prototypes.T), 0, 4), np.float32)
 
     def whitened(self, seasons: Sequence["SeenTwice"], candidates: Drive) -> Self:
-        """What a season changes counting less, landmarks chosen anew."""
-        firsts = [self.unit_vectors(seen.first)[seen.places[:, 0]] for seen in seasons]
-        seconds = [self.unit_vectors(seen.second)[seen.places[:, 1]] for seen in seasons]
+        """The space in which what a season changes counts less, with landmarks chosen anew."""
+        firsts = [self.unit_vectors(pair.first)[pair.places[:, 0]] for pair in seasons]
+        seconds = [self.unit_vectors(pair.second)[pair.places[:, 1]] for pair in seasons]
         whitening = within_place_whitening(np.concatenate(seconds), np.concatenate(firsts))
         projection = whitening if self.projection is None else self.projection @ whitening
         return self.among(candidates, projection, len(self.prototypes))
@@ -202,29 +203,29 @@ def compose_map(
     camera: Sequence[SeenTwice] = (),
     halves: Sequence[int] = (),
 ) -> Built:
-    """The same for `composed`, which chooses its landmarks where it describes: among unit encodings.
+    """A map of `composed`, whose landmarks are chosen among unit encodings, or are those of another map's model.
 
     Args:
         second: Another drive, perhaps of the same route.
-        landmarks: The drive that they are chosen from (the same object as `second` where it is that one: a rehearsal
+        landmarks: The drive from which they are chosen (the same object as `second` where it is that one: a rehearsal
             then leaves a place's own landmark out), the model in which they stay, or None: the training drive.
         n_landmarks: r.
-        camera: What it saw twice on other routes: what a season changes is learnt from that where this route was
-            not seen twice, and landmarks are chosen here.
+        camera: Places of other routes that the camera saw in two seasons: what a season changes is learnt from them
+            where this route was not seen in two, and its landmarks are chosen here.
         halves: See `principal_directions`.
 
     Raises:
-        TooFewCandidatesError: That drive has fewer frames.
+        TooFewCandidatesError: The drive from which landmarks are chosen has fewer frames than `n_landmarks`.
         InvalidEncodingError: The model is of other encodings.
     """
     candidates = training if landmarks is None else landmarks
     space = _Space.first(training, candidates, n_landmarks, halves, lambda share: on_progress(0.6 * share))
     check_list_length(plan.list_length, len(space.prototypes))
     on_progress(0.7)
-    own, season, verdict = space.seen(training), None, None
+    map_drive, season, verdict = space.measured(training), None, None
     other: Drive | None = None
     if second is not None:
-        season, other, verdict = second_season(own, plan.closed, second, plan.same_route, space.seen)
+        season, other, verdict = second_season(map_drive, plan.closed, second, plan.same_route, space.measured)
     on_progress(0.75)
     seen_twice, by_camera = camera, bool(camera)
     if season is not None and other is not None and covers(training.position_m, season.places[:, 0]):
@@ -232,62 +233,64 @@ def compose_map(
     if seen_twice and isinstance(candidates, Drive):
         space = space.whitened(seen_twice, candidates)
     on_progress(0.85)
-    usual, places = Moments.of(training.encodings), space.unit_vectors(training)
+    moments, places = Moments.of(training.encodings), space.unit_vectors(training)
     fused = places
     if season is not None and other is not None:
-        usual, fused = Moments.of(training.encodings, other.encodings), places.copy()
+        moments, fused = Moments.of(training.encodings, other.encodings), places.copy()
         images, frames = season.places.T
         fused[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
-    seen_from = space.chosen if candidates is training else None
-    if candidates is second and season is not None and space.chosen is not None:
-        seen_from = _images_of(season.places, space.chosen)
-    own_places = None if seen_from is None else _own_places(own.route(plan.closed), seen_from)
-    barred, as_chosen = own_places if plan.bars_own_place else None, space
+    landmark_images = space.candidate_frames if candidates is training else None
+    if candidates is second and season is not None and space.candidate_frames is not None:
+        landmark_images = _images_of(season.places, space.candidate_frames)
+    own_places = None if landmark_images is None else _own_places(map_drive.route(plan.closed), landmark_images)
+    barred, initial_space = own_places if plan.bars_own_place else None, space
     if isinstance(candidates, Drive):
         space = space.fitted(fused, plan.list_length, barred)
-        own, other = space.seen(training), None if other is None else space.seen(other)
-    # Landmarks may stay; what is usual is of this map, for robots that encode on board as here
-    model = space.model(usual) if isinstance(candidates, Drive) else {**candidates, "usual": usual.mean_std()}
-    map_ = composed_map(plan, own, fused, usual, model, barred)
-    rehearsal, seen_before = map_, measured_dissimilarities(own)
+        map_drive, other = space.measured(training), None if other is None else space.measured(other)
+    # Landmarks may be another map's; the moments are this one's, so that robots make the same unit vectors as the map
+    model = space.model(moments) if isinstance(candidates, Drive) else {**candidates, "usual": moments.mean_std()}
+    map_ = composed_map(plan, map_drive, fused, moments, model, barred)
+    rehearsal, rehearsal_dissimilarities = map_, measured_dissimilarities(map_drive)
     if season is not None and second is not None:
-        # By landmarks as they were chosen: moved to what both seasons saw, they would know the second one
-        rehearsal = as_chosen.described_in(map_, places, own_places if candidates is second else barred)
-        seen_before = as_chosen.dissimilarities(places)
-        season = SecondSeason(as_chosen.dissimilarities(as_chosen.unit_vectors(second)), season.places)
+        # By the initial landmarks: moved to what both seasons saw, they would know the second one
+        rehearsal = initial_space.described_in(map_, places, own_places if candidates is second else barred)
+        rehearsal_dissimilarities = initial_space.dissimilarities(places)
+        season = SecondSeason(initial_space.dissimilarities(initial_space.unit_vectors(second)), season.places)
     on_progress(0.92)
-    known = (training,) if other is None else (training, other)
-    map_, rehearsal = taught(map_, rehearsal, seen_before, space.dissimilarities(fused), season, known)
-    if isinstance(candidates, Drive) and space.chosen is not None:
-        map_ = replace(map_, **candidates.landmark_origins(space.chosen))
+    seasons = (training,) if other is None else (training, other)
+    map_, rehearsal = taught(map_, rehearsal, rehearsal_dissimilarities, space.dissimilarities(fused), season, seasons)
+    if isinstance(candidates, Drive) and space.candidate_frames is not None:
+        map_ = replace(map_, **candidates.landmark_origins(space.candidate_frames))
     on_progress(1.0)
-    return Built(map_, rehearsal, own, other, verdict, fused, as_chosen.prototypes, by_camera)
+    return Built(map_, rehearsal, map_drive, other, verdict, fused, initial_space.prototypes, by_camera)
 
 
 def taught(
     map_: Map,
     rehearsal: Map,
-    own: NDArray[np.float32],
+    dissimilarities: NDArray[np.float32],
     places: NDArray[np.float32],
     season: SecondSeason | None,
     drives: Sequence[Drive],
 ) -> tuple[Map, Map]:
-    """A `composed` map and its rehearsal with what a further season, or the map itself, tells of views to come.
+    """A `composed` map and its rehearsal with what a second season, or the map itself, tells of views to come.
 
     Args:
-        own, places: [n, r] dissimilarities of the map images to the rehearsal's landmarks, and of what the map's lists
-            stand for to the map's.
-        season: Measured by the rehearsal's landmarks.
+        dissimilarities: [n, r] of the map images to the rehearsal's landmarks.
+        places: [n, r] dissimilarities of what the map's lists stand for to the map's landmarks.
+        season: The second season, measured by the rehearsal's landmarks; None: there is none.
         drives: Every season of the route.
     """
-    learnt = rehearsed(rehearsal, own, season)
+    learnt = rehearsed(rehearsal, dissimilarities, season)
     map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
-    told = own_views(map_, places)
-    first, *others = (drive.encodings for drive in drives)
-    strangest = max([most_strange(first), *(most_strange(first, other) for other in others)])
+    views = own_views(map_, places)
+    first_encodings, *other_encodings = (drive.encodings for drive in drives)
+    strangest = max(
+        [most_strange(first_encodings), *(most_strange(first_encodings, other) for other in other_encodings)]
+    )
     learnt = {
-        "view_bits": view_bits(map_, told, rehearsal, season),
-        "coverage": placed_rightly(rehearsal, told, season),
+        "view_bits": view_bits(map_, views, rehearsal, season),
+        "coverage": placed_rightly(rehearsal, views, season),
         "most_strange": np.array([strangest]),
     }
     return replace(map_, **learnt), replace(rehearsal, **learnt)
@@ -295,15 +298,15 @@ def taught(
 
 def composed_map(
     plan: MapPlan,
-    own: Drive,
+    map_drive: Drive,
     places: NDArray[np.float32],
-    usual: Moments,
+    moments: Moments,
     model: Mapping[str, NDArray[Any]],
     barred: NDArray[np.bool_] | None = None,
 ) -> Map:
-    """The map of places [n, k] that were seen as `own`, but for what a rehearsal teaches."""
+    """The map of places [n, k] seen by `map_drive`, without what a rehearsal teaches."""
     prototypes = np.asarray(model["prototypes"], np.float32)
-    dissimilarities, route = measured_dissimilarities(own), own.route(plan.closed)
+    dissimilarities, route = measured_dissimilarities(map_drive), map_drive.route(plan.closed)
     ranks = rank_landmarks(dissimilarities)
     statistics = LandmarkStatistics.of_map(ranks)
     return Map(
@@ -317,13 +320,13 @@ def composed_map(
         lists=compose(places, prototypes, plan.list_length, barred),
         statistics=np.stack([statistics.mean, statistics.std]),
         loadings=common_factors(statistics.standardise(ranks)),
-        usual_encoding=usual.mean_std(),
+        usual_encoding=moments.mean_std(),
         usual_product=Moments.of((1 - dissimilarities / 2).astype(np.float32)).mean_std(),
     )
 
 
 def measured_dissimilarities(drive: Drive) -> NDArray[np.float32]:
-    """[n, r] of a drive; raises InvalidMapConfigError where they are not measured."""
+    """[n, r] dissimilarities of a drive; raises InvalidMapConfigError where they are not measured."""
     if drive.dissimilarities is None:
         raise InvalidMapConfigError("the drive's dissimilarities are not measured")
     return drive.dissimilarities
@@ -337,16 +340,16 @@ def covers(position_m: NDArray[np.float64], images: NDArray[np.int64]) -> bool:
 
 
 def _images_of(places: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The map image at the place of each of another drive's frames, by pairs of (map image, frame); -1: none."""
+    """[r] the map image that saw the same place as each frame [r], by pairs (map image, frame) [k, 2]; -1: none."""
     image_of = np.full(max(int(places[:, 1].max()), int(frames.max())) + 1, -1)
     image_of[places[:, 1]] = places[:, 0]
     return image_of[frames]
 
 
-def _own_places(route: Route, seen_from: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[n, r] which landmarks were seen from an image's own place, by the image at each one's place, -1: none."""
-    apart_m = np.abs(route.offset_m(route.position_m[:, np.newaxis], route.position_m[seen_from]))
-    return np.asarray((apart_m <= _OWN_PLACE_M) & (seen_from >= 0))
+def _own_places(route: Route, landmark_images: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[n, r] whether a landmark was seen from an image's own place, by the image at each landmark's; -1: none."""
+    apart_m = np.abs(route.offset_m(route.position_m[:, np.newaxis], route.position_m[landmark_images]))
+    return np.asarray((apart_m <= _OWN_PLACE_M) & (landmark_images >= 0))
 
 
 def check_list_length(list_length: int, n_landmarks: int) -> None:
@@ -361,7 +364,7 @@ def check_list_length(list_length: int, n_landmarks: int) -> None:
 
 
 def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool = False) -> Map:
-    """Describe every image of a measured drive by the h landmarks that any relevance but `composed` keeps.
+    """The map of a measured drive, of any relevance but `composed`, with the h landmarks that every image lists.
 
     Returns:
         The map as far as dissimilarities tell; its landmark model, actions and names are the caller's to add.
@@ -378,15 +381,15 @@ def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool
     ranks = rank_landmarks(dissimilarities)
     arrays: dict[str, Any] = {}
     if relevance is Relevance.STANDARDISED:
-        own = LandmarkStatistics.of_map(ranks)
-        scores = own.standardise(ranks)
-        arrays["statistics"] = np.stack([own.mean, own.std])
+        statistics = LandmarkStatistics.of_map(ranks)
+        scores = statistics.standardise(ranks)
+        arrays["statistics"] = np.stack([statistics.mean, statistics.std])
         arrays["loadings"] = common_factors(scores)
         lists = nearest_landmarks(scores, list_length)
     else:
         lists = nearest_landmarks(ranks, list_length)
     if relevance is Relevance.SIMBAD:
-        arrays["values"] = listed(dissimilarities, lists)
+        arrays["values"] = listed_values(dissimilarities, lists)
     route = drive.route(closed)
     return Map(
         config={"relevance": relevance.value, "n_landmarks": n_landmarks},
@@ -400,6 +403,6 @@ def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool
     )
 
 
-def listed(dissimilarities: NDArray[np.float32], lists: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """[h, n] the dissimilarities [n, r] of listed landmarks [h, n]."""
+def listed_values(dissimilarities: NDArray[np.float32], lists: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """[h, n] float32, those dissimilarities [n, r] that belong to the landmarks of lists [h, n]."""
     return np.ascontiguousarray(np.take_along_axis(dissimilarities, lists.T.astype(np.intp), axis=1).T, np.float32)

@@ -1,13 +1,12 @@
 """The scene descriptor: landmarks ranked by dissimilarity (II-C), and what is usual for each of them (ours).
 
-With that a rank can be read as surprising or not. A robot on a thin link sends its nearest landmarks alone. Of every
+What is usual tells whether a rank is surprising. A robot on a thin link sends its nearest landmarks alone. Of every
 other one it is known that it is farther than the last that was sent, and landmarks go together: where one is unusually
 near, those that look like it are too. So the standardised scores z of a view are taken as normal, with the correlations
-that the map's own drive showed, kept as a few common factors: z = loadings @ f + a part of each landmark's own. The
-factors f are placed where all that is known is most probable: the scores that were sent, and for each other landmark
-that it is beyond the last of them (a factor model with censored observations). The expected z stands for one that was
-not sent; its variance says how little is known of it, to whoever weighs evidence, and to the running statistics, which
-take the expected moments as an EM step would.
+of the map's own drive, as a few common factors: z = loadings @ f + a part of each landmark's own. The factors f are the
+most probable ones, given the scores that were sent and that each other landmark is beyond the last of them (a factor
+model with censored observations). The expected z stands in for one that was not sent; its variance says how little is
+known of it, both to relevances and to the running statistics, which take the expected moments as an EM step would.
 """
 
 import math
@@ -31,7 +30,7 @@ _ALL_KNOWN = np.ones(1)
 _MAX_FACTORS = 64
 _MAX_FACTOR_FRAMES = 1024  # neighbouring frames of a drive say the same
 _LEAST_FACTOR_FRAMES = 30
-_LEAST_OWN_VARIANCE = 0.02  # of a landmark, whatever the factors explain
+_LEAST_OWN_VARIANCE = 0.02  # of a landmark's variance, 1, that the factors leave to itself
 _NEWTON_STEPS = 20  # at most; three or four are usual
 _NEWTON_TOLERANCE = 1e-3  # in a score's standard deviations
 _ASYMPTOTIC_FROM = 30.0
@@ -61,7 +60,7 @@ def rank_landmarks(dissimilarities: ArrayLike) -> NDArray[np.float32]:
 def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.float32]:
     """[r] ranks of all landmarks from the ids that a robot sent, nearest first, 1..r of them.
 
-    Landmarks that were not sent share the mean of the ranks left; `n_ranked` tells them.
+    Landmarks that were not sent share the mean of the ranks left, from which `n_ranked` counts those that were.
 
     Raises:
         InvalidRankedLandmarksError: None, too many, out of range or listed twice.
@@ -74,16 +73,16 @@ def ranks_from_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -
 
 
 def n_ranked(ranks: NDArray[np.float32]) -> int:
-    """How many landmarks a view [r] has a rank of its own for: the nearest m, the others share the mean rank left.
+    """How many landmarks of ranks [r] have one of their own, the nearest m; the others share the mean rank left.
 
-    r where all ranks are known, 0 for a view that shows nothing.
+    r where all ranks are known, 0 of a view that shows nothing.
     """
     last = float(ranks.max())
     return ranks.size if last == ranks.size else round(2 * last) - 1 - ranks.size
 
 
 def checked_ranking(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np.int64]:
-    """[m] ids that a ranking may begin with; raises InvalidRankedLandmarksError."""
+    """[m] int64, the ids given, nearest first; raises InvalidRankedLandmarksError where they are no ranking."""
     n_sent = len(landmark_ids)
     if not 1 <= n_sent <= n_landmarks:
         raise wrong_number(n_sent, n_landmarks)
@@ -101,7 +100,7 @@ def checked_ranking(landmark_ids: Sequence[int], n_landmarks: int) -> NDArray[np
 
 
 def wrong_number(n_sent: int, n_landmarks: int) -> InvalidRankedLandmarksError:
-    """None or more than there are."""
+    """The error for a ranking of no landmark, or of more than there are."""
     return InvalidRankedLandmarksError(
         f"{n_sent} ranked landmarks sent; send 1 to {n_landmarks}, nearest first", n_landmarks=n_landmarks
     )
@@ -145,26 +144,26 @@ class LandmarkStatistics(Moments):
     """Running mean and spread of every landmark's normal score, [r]."""
 
     prior_weight = PRIOR_WEIGHT_FRAMES
-    # [r, q] float32 on common factors, from which landmarks' correlations follow; None: not known, each is taken for
-    # itself
+    # [r, q] float32 on common factors, which give the landmarks' correlations; None: unknown, they count as none
     loadings: NDArray[np.float32] | None = None
 
     @classmethod
     def of_map(cls, ranks: NDArray[np.float32]) -> Self:
-        """The statistics of a traverse of ranks [n, r], weighed as the prior of a live session."""
+        """The statistics of a traverse of ranks [n, r], weighted as the prior of a live session."""
         scores = normal_scores(ranks, ranks.shape[1])
         return cls(cls.prior_weight, scores.mean(axis=0), np.square(scores).mean(axis=0))
 
     @cached_property
     def std(self) -> NDArray[np.float64]:
-        """[r] float64. A landmark that never moved is given the spread that normal scores have, 1."""
+        """[r] float64; 1, the spread of normal scores, of a landmark whose score never changed."""
         std = np.sqrt(np.maximum(self.square - np.square(self.mean), 0.0))
         return np.where(std > _LEAST_STD, std, 1.0)
 
     def observing(self, ranks: NDArray[np.float32], worth: float = 1.0) -> Self:
-        """The statistics after one more frame, [r] ranks, or one more of every drive, [e, r]; it counts in its own z.
+        """The statistics after one more frame of ranks [r], or of each of e sessions, [e, r].
 
-        Of landmarks that were not sent the expected moments count; `worth` of a frame that saw little new is below 1.
+        Of landmarks that were not sent the expected moments count; `worth` is less than 1 of a frame that saw little
+        new.
         """
         scores = normal_scores(ranks, ranks.shape[-1])
         squares = np.square(scores)
@@ -179,17 +178,17 @@ class LandmarkStatistics(Moments):
         return replace(self, weight=weight, mean=mean, square=square)
 
     def standardise(self, ranks: NDArray[np.float32]) -> NDArray[np.float64]:
-        """z of ranks that are all known, [r] or [n, r]: normal scores less their mean, over their spread.
+        """z of ranks [r] or [n, r], all of them sent: normal scores less their mean, over their spread.
 
         Lowest is nearest.
         """
         return (normal_scores(ranks, ranks.shape[-1]) - self.mean) / self.std
 
     def view(self, ranks: NDArray[np.float32]) -> ViewScores:
-        """What a view says of every landmark, of those too that a robot did not send.
+        """What a view says of every landmark, also of those that a robot did not send.
 
         Args:
-            ranks: [r]; of a batch [e, r], all of them sent.
+            ranks: [r]; or of a batch, all of them sent, [e, r].
         """
         n_landmarks = ranks.shape[-1]
         n_sent = n_landmarks if ranks.ndim > 1 else n_ranked(ranks)
@@ -198,24 +197,26 @@ class LandmarkStatistics(Moments):
         if n_sent == 0:
             return ViewScores(np.zeros(n_landmarks), np.zeros(n_landmarks))
         z, certainty = self.standardise(ranks), np.ones(n_landmarks)
-        sent = ranks <= n_sent
-        between = np.full(1, n_sent + 0.5, np.float32)  # the last that was sent and the first that was not
-        loadings = np.zeros((n_landmarks, 0), np.float32) if self.loadings is None else self.loadings
-        least = ((normal_scores(between, n_landmarks) - self.mean) / self.std)[~sent]
-        z[~sent], variance = _expected_beyond(least, loadings[~sent], z[sent], loadings[sent])
-        certainty[~sent] = 1.0 - np.minimum(variance, 1.0)
+        is_sent = ranks <= n_sent
+        border_rank = np.full(1, n_sent + 0.5, np.float32)  # between the last that was sent and the first that was not
+        loadings = np.zeros((n_landmarks, 0)) if self.loadings is None else self.loadings.astype(np.float64)
+        bounds = ((normal_scores(border_rank, n_landmarks) - self.mean) / self.std)[~is_sent]
+        z[~is_sent], variance = _expected_beyond(bounds, loadings[~is_sent], z[is_sent], loadings[is_sent])
+        certainty[~is_sent] = 1.0 - np.minimum(variance, 1.0)
         return ViewScores(z, certainty)
 
 
 def common_factors(scores: NDArray[np.float64]) -> NDArray[np.float32] | None:
-    """How landmarks go together over a drive, as loadings on its principal components.
+    """The correlations of landmarks over a drive, as their loadings on its principal components.
 
-    Correlations of few frames show more than there is, so they are shrunk as far as chance alone would explain them
-    (Schäfer and Strimmer). A landmark keeps a variance of its own.
+    Correlations over few frames are too large, so they are shrunk by as much as chance explains (Schäfer and Strimmer).
+    A landmark keeps a variance of its own.
+
+    Args:
+        scores: [n, r], standardised over the drive.
 
     Returns:
-        [r, q] of scores [n, r] standardised over the drive, each number one that float16 holds too; None where the
-        frames are too few to tell.
+        [r, q] float32, of numbers that float16 holds too; None where the frames are too few.
     """
     n, n_landmarks = scores.shape
     if n < _LEAST_FACTOR_FRAMES or n_landmarks == 1:
@@ -223,64 +224,63 @@ def common_factors(scores: NDArray[np.float64]) -> NDArray[np.float32] | None:
     if n > _MAX_FACTOR_FRAMES:
         scores = scores[np.linspace(0, n - 1, _MAX_FACTOR_FRAMES).round().astype(np.intp)]
     _, strength, components = np.linalg.svd(scores / math.sqrt(len(scores)), full_matrices=False)
-    mean_square = max((np.sum(strength**4) - n_landmarks) / (n_landmarks * (n_landmarks - 1)), 1e-12)  # correlation's
+    mean_square = max((np.sum(strength**4) - n_landmarks) / (n_landmarks * (n_landmarks - 1)), 1e-12)  # of correlations
     by_chance = (1.0 - min(mean_square, 1.0)) ** 2 / (len(scores) - 1)
-    shrunk = max(1.0 - by_chance / mean_square, 0.0)
-    loadings = math.sqrt(shrunk) * (strength[:_MAX_FACTORS, np.newaxis] * components[:_MAX_FACTORS]).T
-    shared = np.square(loadings).sum(axis=1)
-    loadings *= np.sqrt((1.0 - _LEAST_OWN_VARIANCE) / np.maximum(shared, 1.0 - _LEAST_OWN_VARIANCE))[:, np.newaxis]
+    real_share = max(1.0 - by_chance / mean_square, 0.0)
+    loadings = math.sqrt(real_share) * (strength[:_MAX_FACTORS, np.newaxis] * components[:_MAX_FACTORS]).T
+    common_variance, limit = np.square(loadings).sum(axis=1), 1.0 - _LEAST_OWN_VARIANCE
+    loadings *= np.sqrt(limit / np.maximum(common_variance, limit))[:, np.newaxis]
     return np.asarray(loadings, np.float16).astype(np.float32)
 
 
 def _expected_beyond(
-    least: NDArray[np.float64],
-    loadings: NDArray[np.float32],
-    sent: NDArray[np.float64],
-    loadings_sent: NDArray[np.float32],
+    bounds: NDArray[np.float64],
+    loadings: NDArray[np.float64],
+    sent_scores: NDArray[np.float64],
+    sent_loadings: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and variance, [u] each, of scores of which it is known only that they exceed some value.
+    """Mean and variance, [u] each, of scores that were not sent, given those sent and that they exceed bounds.
 
     Args:
-        least: [u], that value.
-        loadings: [u, q].
-        sent: [m] the other scores, which are known.
-        loadings_sent: [m, q].
+        bounds: [u] which the scores exceed.
+        loadings: [u, q] of their landmarks.
+        sent_scores: [m] that were sent.
+        sent_loadings: [m, q] of their landmarks.
     """
-    unsent, others = loadings.astype(np.float64), loadings_sent.astype(np.float64)
-    own, own_others = _own_variance(unsent), _own_variance(others)
-    std = np.sqrt(own)
-    # Gradient and curvature of the log-probability of the factors f, but for what the bounds add: pull - curved @ f.
-    pull = others.T @ (sent / own_others)
-    curved = np.eye(others.shape[1]) + others.T @ (others / own_others[:, np.newaxis])
-    factors, precision = np.linalg.solve(curved, pull), curved
+    own_variance, sent_variance = _own_variance(loadings), _own_variance(sent_loadings)
+    std = np.sqrt(own_variance)
+    # The log-probability of the factors f has gradient pull - curvature @ f, but for what the bounds add.
+    pull = sent_loadings.T @ (sent_scores / sent_variance)
+    curvature = np.eye(sent_loadings.shape[1]) + sent_loadings.T @ (sent_loadings / sent_variance[:, np.newaxis])
+    factors, precision = np.linalg.solve(curvature, pull), curvature
     for _ in range(_NEWTON_STEPS):
-        hazard, narrowed = _hazards((least - unsent @ factors) / std)
-        precision = curved + unsent.T @ (unsent * (narrowed / own)[:, np.newaxis])
-        step = np.linalg.solve(precision, pull - curved @ factors + unsent.T @ (hazard / std))
+        hazard, narrowing = _hazards((bounds - loadings @ factors) / std)
+        precision = curvature + loadings.T @ (loadings * (narrowing / own_variance)[:, np.newaxis])
+        step = np.linalg.solve(precision, pull - curvature @ factors + loadings.T @ (hazard / std))
         factors = factors + step
         if np.abs(step).max(initial=0.0) < _NEWTON_TOLERANCE:
             break
-    hazard, narrowed = _hazards((least - unsent @ factors) / std)
-    of_factors = np.einsum("uq,qu->u", unsent, np.linalg.solve(precision, unsent.T))
-    mean = unsent @ factors + std * hazard
-    return mean, own * (1.0 - narrowed) + np.square(1.0 - narrowed) * of_factors
+    hazard, narrowing = _hazards((bounds - loadings @ factors) / std)
+    of_factors = np.einsum("uq,qu->u", loadings, np.linalg.solve(precision, loadings.T))
+    mean = loadings @ factors + std * hazard
+    return mean, own_variance * (1.0 - narrowing) + np.square(1.0 - narrowing) * of_factors
 
 
 def _own_variance(loadings: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What of each landmark's variance, 1, the common factors leave, [r]."""
+    """[r] the part of each landmark's variance, 1, that the common factors leave."""
     return np.asarray(np.maximum(1.0 - np.square(loadings).sum(axis=1), _LEAST_OWN_VARIANCE / 2))
 
 
 @njit(cache=True, nogil=True)
 def _hazards(bounds: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean of what of the standard normal lies beyond each bound, and 1 less its variance; [u] each."""
-    mean, narrowed = np.empty(bounds.size), np.empty(bounds.size)
-    for place, bound in enumerate(bounds):
+    """Mean of the standard normal beyond each bound [u], and 1 less its variance there; [u] each."""
+    mean, narrowing = np.empty(bounds.size), np.empty(bounds.size)
+    for i, bound in enumerate(bounds):
         if bound > _ASYMPTOTIC_FROM:  # the upper tail would underflow
             hazard = bound + 1.0 / (bound + 2.0 / bound)
         else:
             density = math.exp(-0.5 * bound * bound) * math.sqrt(2.0 / math.pi)
             hazard = density / math.erfc(bound / math.sqrt(2.0))
-        mean[place] = hazard
-        narrowed[place] = min(max(hazard * (hazard - bound), 0.0), 1.0)
-    return mean, narrowed
+        mean[i] = hazard
+        narrowing[i] = min(max(hazard * (hazard - bound), 0.0), 1.0)
+    return mean, narrowing

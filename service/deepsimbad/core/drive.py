@@ -1,7 +1,7 @@
 """A recorded drive, and whether two of them saw one route (ours), so that the map of one may learn from the other.
 
 Positions count from where a recording began: drives of two places have equal ones too. So the positions must be said to
-be comparable, by x, y or in so many words, and then the views must agree at equal positions better than they do where
+be comparable, by x, y or by the caller, and then the views must agree at equal positions better than they do where
 one drive is shifted against the other.
 
 A route that changes slowly makes the test harder than it looks. Shifts by one station and by two are nearly one and the
@@ -35,25 +35,25 @@ from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidMa
 MAX_FRAME_INDEX = 2**53
 MAX_NAME_LENGTH = 255  # characters; file systems allow no more
 FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
-SHOWS_NOTHING = "show nothing: one grey, noise or the dark"  # said of pictures
+SHOWS_NOTHING = "show nothing: one grey, noise or the dark"  # continues a sentence about pictures
 UNLIKE_ALL = "are so unlike all others that they may show nothing of the route: glare, or the dark"
 _ROWS_AT_ONCE, _NAMED = 1024, 3
 
-SIGNIFICANCE = 0.002  # of the agreement at shift 0, up to which it counts as more than chance
-# Mean, of scores at equal positions; where scenery repeats, chance goes far, but rarely this far
+SIGNIFICANCE = 0.002  # chance of the agreement at shift 0, up to which it counts as real
+# Of scores at equal positions, on average; where scenery repeats, drives of two routes rarely reach it by chance
 LEAST_CORRELATION = 0.2
 # Recordings of one day teach that what comes will look as the map does. On NetVLAD's Nordland, where one drive alone
 # holds 89 % of single views in their 95 % sets, copies with noise left 39 % (correlation 0.997), 57 % (0.97) and 80 %
 # (0.90); real second drives correlate by 0.51 to 0.75 (prototypes; no command prints these). Robots may drive under
-# one light for ever: it is told, not refused.
+# one light for ever, so such drives are reported, not refused.
 LIKE_ONE_DAY = 0.9
-ONE_RECORDING = 0.999  # copies of one, which teach nothing
-LEAST_PLACES = 30  # that both saw
-_STATION_M = 1.0  # frames nearer together, as of a robot that stands, say nothing new
-_FEWEST_STATIONS, _MOST_STATIONS = 64, 512  # a short route is cut finer, a long one coarser
+ONE_RECORDING = 0.999  # correlation from which two drives are copies of one recording, which teach nothing
+LEAST_PLACES = 30  # seen by both drives
+_STATION_M = 1.0  # frames nearer together, as of a robot that stands, tell nothing new
+_FEWEST_STATIONS, _MOST_STATIONS = 64, 512  # a short route has shorter stations, a long one longer
 _SURROUNDINGS = 16  # stations to either side
-_LEAST_CYCLES = 1  # along the stretch that both saw: its mean tells nothing
-_LEAST_SPREAD = 1e-9  # of similarities; below, one drive shows the same everywhere
+_LEAST_CYCLES = 1  # along the stretch that both saw; 0 cycles, the mean, tell nothing
+_LEAST_SPREAD = 1e-9  # standard deviation of similarities; with less one drive shows the same everywhere
 
 _Unknown: Any = None  # filled in by __post_init__
 
@@ -62,25 +62,27 @@ _Unknown: Any = None  # filled in by __post_init__
 class Drive:
     """Frames of one traverse, in the order they were driven."""
 
-    name: str = ""  # of the traverse; "" of a recording that is none
+    name: str = ""  # of the traverse; "" where the recording is none
     camera: Camera | None = None  # of most of its pictures; None where there are none, or nobody knows
     # Route position, [n] float64, at most MAX_POSITION_M either way; need not increase here
     position_m: NDArray[np.float64]
     encodings: NDArray[np.float32]  # [n, d] float32, finite
-    index: NDArray[np.int64] = _Unknown  # place in the whole recording, [n] int64, distinct, from 0
+    index: NDArray[np.int64] = _Unknown  # number in the whole recording, [n] int64, distinct, from 0
     timestamp_us: NDArray[np.int64] = _Unknown  # [n] int64, microseconds, -1 where unknown
     x_m: NDArray[np.float64] = _Unknown  # east, [n] float64, at most MAX_POSITION_M either way, NaN where unknown
     y_m: NDArray[np.float64] = _Unknown  # north, likewise
-    frame_name: NDArray[np.str_] = _Unknown  # in the recording, as of its file, [n] str, "" where unknown
-    content_digest: NDArray[np.uint64] = _Unknown  # of what was posted, [n] uint64, 0: its encoding, or unknown
-    # Of the network that encoded images among them; None where none did, or nobody knows
+    frame_name: NDArray[np.str_] = _Unknown  # such as its file's, [n] str, "" where unknown
+    content_digest: NDArray[np.uint64] = (
+        _Unknown  # of a posted picture, [n] uint64; 0 where an encoding was posted, or unknown
+    )
+    # Of the network that encoded images among the frames; None where none did, or nobody knows
     weights_sha256: str | None = None
-    # What is shown black and white of pictures of more than 8 bits; None: there were none
+    # Levels shown as black and as white of pictures of more than 8 bits; None where there are none
     grey_levels: tuple[int, int] | None = None
-    shows_nothing: NDArray[np.bool_] = _Unknown  # [n] whether the picture of a frame does; False where nobody looked
+    shows_nothing: NDArray[np.bool_] = _Unknown  # [n] whether a frame's picture does; False where unknown
     # [n, r] float32 to a map's landmarks, smaller is nearer; None before they are measured
     dissimilarities: NDArray[np.float32] | None = None
-    # [n] `digests` of encodings that something else stands for by now, see `standing_for`; None: of those there are
+    # [n] `digests` of the encodings that others now stand in for, see `standing_for`; None where none do
     first_digests: NDArray[np.uint64] | None = None
 
     def __post_init__(self) -> None:
@@ -109,18 +111,18 @@ class Drive:
         return int(self.encodings.shape[1])
 
     def at(self, frames: NDArray[np.integer[Any]]) -> Self:
-        """Some of the frames alone."""
+        """The drive of some of its frames."""
         arrays = {name: array[frames] for name, array in vars(self).items() if isinstance(array, np.ndarray)}
         return replace(self, **arrays)
 
     def standing_for(self, vectors: NDArray[np.float32]) -> Self:
-        """With vectors [n, k] in place of encodings, where a map compares those; frames are known as before."""
+        """The drive with vectors [n, k] in place of encodings, for maps that compare those; its digests stay."""
         return replace(self, encodings=vectors, first_digests=self.digests())
 
     def check_differs(self, name: str) -> None:
-        """Raise InvalidEncodingError where no frame can be told from another."""
-        first, *others = self.encodings
-        if others and all(np.array_equal(first, row) for row in others):
+        """Raise InvalidEncodingError where all encodings of the drive called `name` are the same."""
+        first, *other_rows = self.encodings
+        if other_rows and all(np.array_equal(first, row) for row in other_rows):
             raise InvalidEncodingError(
                 f"all {self.n_frames} frames of {name} have one and the same encoding, which tells no place from "
                 "another: is the lens covered, or the extractor broken? Record another drive"
@@ -128,24 +130,24 @@ class Drive:
 
     @property
     def is_unlike_all(self) -> NDArray[np.bool_]:
-        """[n] whether a frame shows nothing of the route, as far as encodings tell and its picture does not."""
+        """[n] whether a frame's encoding says that it shows nothing of the route, where its picture does not say so."""
         starts = range(0, self.n_frames, _ROWS_AT_ONCE)
         unlike = shows_nothing(lambda: (self.encodings[start : start + _ROWS_AT_ONCE] for start in starts))
         return unlike & ~self.shows_nothing
 
-    def picture_warnings(self, whose: str) -> list[str]:
-        """What a person should know of its pictures, called as "of the map", in sentences."""
-        same = [False, *(np.array_equal(before, after) for before, after in pairwise(self.encodings))]
-        hung = np.array(same) & (np.diff(self.position_m, prepend=np.inf) > 0) & ~self.shows_nothing
-        told = (
+    def picture_warnings(self, owner: str) -> list[str]:
+        """Sentences about pictures that show nothing or repeat; `owner` says whose they are, as "of the map"."""
+        is_repeated = [False, *(np.array_equal(previous, current) for previous, current in pairwise(self.encodings))]
+        is_hanging = np.array(is_repeated) & (np.diff(self.position_m, prepend=np.inf) > 0) & ~self.shows_nothing
+        findings = (
             (self.shows_nothing, SHOWS_NOTHING),
             (self.is_unlike_all, UNLIKE_ALL),
-            (hung, "are the very same as the one before, and the robot had moved on: did the camera hang?"),
+            (is_hanging, "are the very same as the one before, and the robot had moved on: did the camera hang?"),
         )
         return [
-            f"{int(these.sum())} of {self.n_frames} pictures {whose} {what}{_named(self.frame_name[these])}"
-            for these, what in told
-            if these.any()
+            f"{int(is_found.sum())} of {self.n_frames} pictures {owner} {text}{_first_names(self.frame_name[is_found])}"
+            for is_found, text in findings
+            if is_found.any()
         ]
 
     def route(self, closed: bool = False) -> Route:
@@ -158,10 +160,10 @@ class Drive:
         return Route(self.position_m, closed, self.x_m if has_plane else None, self.y_m if has_plane else None)
 
     def digests(self) -> NDArray[np.uint64]:
-        """[n] one digest a frame of its encoding's bytes; kept in map files, so it stays as it is.
+        """[n] uint64 digests of the frames' encodings; stored in map files, so they never change.
 
-        A frame is known by its encoding, whatever traverse it is in: a drive that was uploaded again under another name
-        is found out, and so is one that was deleted since, or that came with a map of another server.
+        An encoding identifies a frame in whatever traverse it is: a drive that is uploaded again under another name is
+        recognised, even if it was deleted since or came with a map of another server.
         """
         if self.first_digests is not None:
             return self.first_digests
@@ -169,7 +171,7 @@ class Drive:
         return np.fromiter((content_digest(row.tobytes()) for row in rows), np.uint64, len(rows))
 
     def origins(self) -> dict[str, Any]:
-        """Where every frame came from, as the named arrays of a map that is made of them."""
+        """The origins of the frames [n], as the named arrays of a map that is made of them; None where unknown."""
         return {
             "timestamp_us": self.timestamp_us if (self.timestamp_us != UNKNOWN_TIMESTAMP).any() else None,
             "frame_digest": self.digests(),
@@ -178,7 +180,7 @@ class Drive:
         }
 
     def landmark_origins(self, frames: NDArray[np.int64]) -> dict[str, Any]:
-        """Where landmarks came from that began as some of its frames [r], as the named arrays of a map."""
+        """The origins of landmarks that began as the given frames [r] of the drive, as the named arrays of a map."""
         origins = self.at(frames).origins()
         parts = {"landmark_digest": "frame_digest", "landmark_frame": "frame_name", "landmark_drive": "frame_drive"}
         return {name: origins[part] for name, part in parts.items() if origins[part] is not None}
@@ -187,7 +189,7 @@ class Drive:
         """The same frames with exact dtypes, fit to be stored.
 
         Raises:
-            InvalidInputError: Shapes differ, an index is out of range or there twice, a place is too far away.
+            InvalidInputError: Shapes differ, an index is out of range or repeated, a position is too far away.
             InvalidRouteError: A position is NaN or too far away.
             InvalidEncodingError: An encoding is empty or not finite.
         """
@@ -272,34 +274,34 @@ class SecondSeason:
     """What another drive of the mapped route tells of it."""
 
     dissimilarities: NDArray[np.float32]  # [m, r] of its frames to the landmarks
-    places: NDArray[np.int64]  # [k, 2] int64, (map image, its frame) where both saw the same place; some
-    encodings: NDArray[np.float32] | None = None  # [m, d], for maps that compare them whole
+    places: NDArray[np.int64]  # [k, 2] int64, pairs (map image, its frame) that saw the same place
+    encodings: NDArray[np.float32] | None = None  # [m, d], for `brute_force` maps, which compare them
 
     def views(self, frames: NDArray[np.int64]) -> Query:
-        """Some of its frames as live views, a batch."""
+        """The given frames [e] as a batch of live views."""
         encodings = None if self.encodings is None else self.encodings[frames]
         return Query(rank_landmarks(self.dissimilarities[frames]), self.dissimilarities[frames], encodings)
 
 
 @dataclass(frozen=True)
 class SameRoute:
-    """Whether a drive saw the mapped route."""
+    """Whether a drive saw the mapped route, and how that was decided."""
 
-    accepted: bool  # it did: the map may learn from it
+    accepted: bool  # whether it did, so that the map may learn from it
     why: str | None  # in a sentence, why it was not accepted; None where it was
     n_pairs: int  # frames that have a map image at their position
-    # Mean correlation of landmarks' scores at equal positions; None where nothing was compared
+    # Mean correlation of landmarks' scores at equal positions; None where they were not compared
     correlation: float | None = None
-    # Agreement at equal positions, in standard deviations of the agreement over all shifts; None likewise
+    # Agreement at equal positions, in standard deviations over all shifts; None likewise
     statistic: float | None = None
-    significance: float | None = None  # chance that drives of two routes agree so well or better; None likewise
+    significance: float | None = None  # chance that drives of two routes agree as well or better; None likewise
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""
         return asdict(self)
 
     def remarks(self) -> tuple[str, ...]:
-        """What a person should know of what was learnt."""
+        """Warnings about what the map learnt from the drive."""
         if not self.accepted or self.correlation is None or self.correlation <= LIKE_ONE_DAY:
             return ()
         return (
@@ -310,117 +312,120 @@ class SameRoute:
 
 
 def second_season(
-    own: Drive, closed: bool, other: Drive, same_route: bool | None, measure: Callable[[Drive], Drive]
+    map_drive: Drive, closed: bool, other: Drive, same_route: bool | None, measure: Callable[[Drive], Drive]
 ) -> tuple[SecondSeason | None, Drive | None, SameRoute]:
-    """What a map can learn from another drive: something only where both drove one route.
+    """What a map can learn from another drive, if both are of one route.
 
     Args:
-        own: The drive that becomes the map, its dissimilarities measured.
-        same_route: Whether positions are said to be comparable; None: where both know x, y.
-        measure: Measures the other's dissimilarities; asked only where positions are comparable.
+        map_drive: The drive that becomes the map, its dissimilarities measured.
+        same_route: Whether the drives' positions are comparable; None: they are where both know x, y.
+        measure: Measures the other drive's dissimilarities; called only where positions are comparable.
 
     Returns:
-        What it tells and the measured drive, None both where it tells nothing; and the verdict.
+        The second season and the measured drive, both None where the map cannot learn from it; and the verdict.
     """
-    route, other_route = own.route(closed), other.route()
+    route, other_route = map_drive.route(closed), other.route()
     if same_route is False:
         return None, None, SameRoute(False, "the two drives are said not to share their positions", 0)
     if same_route is None and (route.x_m is None or other_route.x_m is None):
-        why = "without x, y of both drives nothing says that their positions are comparable; say same_route"
-        return None, None, SameRoute(False, why, 0)
-    if own.dissimilarities is None or (other := measure(other)).dissimilarities is None:
+        reason = "without x, y of both drives nothing says that their positions are comparable; say same_route"
+        return None, None, SameRoute(False, reason, 0)
+    if map_drive.dissimilarities is None or (other := measure(other)).dissimilarities is None:
         raise InvalidMapConfigError("dissimilarities are not measured")
     places = same_places(other_route, route)
-    verdict = judge(own.dissimilarities, other.dissimilarities, places, own.position_m)
+    verdict = judge(map_drive.dissimilarities, other.dissimilarities, places, map_drive.position_m)
     if not verdict.accepted:
         return None, None, verdict
     return SecondSeason(other.dissimilarities, places), other, verdict
 
 
 def judge(
-    own: NDArray[np.float32], other: NDArray[np.float32], places: NDArray[np.int64], position_m: NDArray[np.float64]
+    map_dissimilarities: NDArray[np.float32],
+    drive_dissimilarities: NDArray[np.float32],
+    places: NDArray[np.int64],
+    position_m: NDArray[np.float64],
 ) -> SameRoute:
     """Test whether drives with comparable positions saw one route.
 
     Args:
-        own: [n, r] dissimilarities of the map images, taken at `position_m` [n], to the landmarks.
-        other: [m, r] of the other drive's frames.
+        map_dissimilarities: [n, r] of the map images, taken at `position_m` [n], to the landmarks.
+        drive_dissimilarities: [m, r] of the other drive's frames.
         places: [k, 2] (map image, frame) at equal positions.
     """
     stations = _stations(places, position_m)
     if len(stations) < LEAST_PLACES:
-        few = f"the two drives share {len(stations)} places by their positions, and {LEAST_PLACES} are the least"
-        return SameRoute(False, few, len(places))
+        too_few = f"the two drives share {len(stations)} places by their positions, and {LEAST_PLACES} are the least"
+        return SameRoute(False, too_few, len(places))
     images, frames = stations.T
-    scores, others = _scores(own[images]), _scores(other[frames])
-    correlation = float((scores * others).mean())
-    statistic = _agreement(_against_surroundings(scores), _against_surroundings(others))
+    map_scores, drive_scores = _scores(map_dissimilarities[images]), _scores(drive_dissimilarities[frames])
+    correlation = float((map_scores * drive_scores).mean())
+    statistic = _agreement(_against_surroundings(map_scores), _against_surroundings(drive_scores))
     significance = NormalDist().cdf(-statistic)
-    why: str | None = None
+    reason: str | None = None
     if significance > SIGNIFICANCE:
-        why = (
+        reason = (
             "at equal positions the two drives agree no better than where one is shifted against the other "
             f"(significance {significance:.2g}, {SIGNIFICANCE:g} is asked for)"
         )
     elif correlation < LEAST_CORRELATION:
-        why = (
+        reason = (
             f"at equal positions the two drives agree too little to learn from (mean correlation {correlation:.2f}, "
             f"{LEAST_CORRELATION:g} is asked for)"
         )
     elif correlation > ONE_RECORDING:
-        why = f"the two drives are copies of one recording (mean correlation {correlation:.5f} at equal positions)"
-    return SameRoute(why is None, why, len(places), correlation, statistic, significance)
+        reason = f"the two drives are copies of one recording (mean correlation {correlation:.5f} at equal positions)"
+    return SameRoute(reason is None, reason, len(places), correlation, statistic, significance)
 
 
 def _stations(places: NDArray[np.int64], position_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Pairs [s, 2] in route order, one of each stretch of equal length that has any."""
+    """[s, 2] some of the pairs, in route order: the first of each stretch of equal length that has any."""
     ordered = places[np.argsort(position_m[places[:, 0]], kind="stable")]
     if len(ordered) == 0:
         return ordered
     at_m = position_m[ordered[:, 0]] - position_m[ordered[0, 0]]
     station_m = np.clip(_STATION_M, at_m[-1] / _MOST_STATIONS, at_m[-1] / _FEWEST_STATIONS)
-    # What lies on a border belongs to the stretch behind it, however positions were rounded.
+    # A pair on a border belongs to the stretch behind it, however positions were rounded.
     stretch = np.floor(at_m / station_m * (1 + 1e-9)) if station_m > 0 else at_m
     return np.asarray(ordered[np.unique(stretch, return_index=True)[1]], np.int64)
 
 
 def _scores(dissimilarities: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[s, r] standardised by what is usual over these stations."""
+    """[s, r] normal scores of dissimilarities [s, r], standardised over the stations."""
     ranks = rank_landmarks(dissimilarities)
     return LandmarkStatistics.of_map(ranks).standardise(ranks)
 
 
 def _against_surroundings(scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[s, r] scores less their mean over the surroundings."""
-    before = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
+    """[s, r] scores less their mean over the stations around each."""
+    sums = np.concatenate([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
     station = np.arange(len(scores))
     first, stop = np.maximum(station - _SURROUNDINGS, 0), np.minimum(station + _SURROUNDINGS + 1, len(scores))
-    return np.asarray(scores - (before[stop] - before[first]) / (stop - first)[:, np.newaxis])
+    return np.asarray(scores - (sums[stop] - sums[first]) / (stop - first)[:, np.newaxis])
 
 
-def _agreement(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Agreement at shift 0 of two drives' scores along the route, [s, r], in standard deviations over all shifts."""
-    similarity = own @ other.T / own.shape[1]
+def _agreement(scores: NDArray[np.float64], other_scores: NDArray[np.float64]) -> float:
+    """Agreement of two drives' scores [s, r] at shift 0 along the route, in standard deviations over all shifts."""
+    similarity = scores @ other_scores.T / scores.shape[1]
     if similarity.std() < _LEAST_SPREAD:
         return 0.0
-    # Ranked, a few places that are unlike all others (tunnels) count as any other places do.
+    # By ranks a few places that are unlike all others (tunnels) count no more than other places do.
     ranked = (_normal_ranks(similarity) + _normal_ranks(similarity.T).T) / 2
     spectrum = np.fft.fft2(ranked)
     power = np.square(np.abs(spectrum))
     cycles = np.arange(_LEAST_CYCLES, (len(ranked) + 1) // 2)
-    # A drive's slow frequencies are its strongest, and those that noise and inexact positions spoil least, yet a few.
-    # Divided by the square root of what they would have by chance, they lead without deciding alone.
+    # A drive's few slow frequencies are its strongest, and those that noise and inexact positions spoil least. Divided
+    # by the square root of the strength that they would have by chance, they lead without deciding alone.
     by_chance = power.sum(axis=1)[cycles] * power.sum(axis=0)[-cycles]
     cross = spectrum[cycles, -cycles] / np.sqrt(np.sqrt(np.maximum(by_chance, np.finfo(np.float64).tiny)))
     return float(cross.real.sum() / max(np.sqrt(np.square(np.abs(cross)).sum() / 2), np.finfo(np.float64).tiny))
 
 
 def _normal_ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normal scores of every row's ranks."""
+    """[s, s] normal scores of the ranks of every row."""
     return normal_scores(rank_landmarks(values), values.shape[1])
 
 
-def _named(names: NDArray[np.str_]) -> str:
-    """The first of some frames by name, in brackets; "" where none has one."""
-    known = names[names != ""].tolist()
-    return f" ({', '.join(known[:_NAMED])}{', ...' if len(known) > _NAMED else ''})" if known else ""
+def _first_names(names: NDArray[np.str_]) -> str:
+    """The first few of frames' names, in brackets after a space; "" where no frame has one."""
+    known_names = names[names != ""].tolist()
+    return f" ({', '.join(known_names[:_NAMED])}{', ...' if len(known_names) > _NAMED else ''})" if known_names else ""

@@ -29,10 +29,10 @@ class Relevance(StrEnum):
 
 
 DEFAULT_RELEVANCE = Relevance.COMPOSED
-FAR_STD = 2.0  # deviations from what is usual
-_MOST_FAR = 3 / 16  # of a view's numbers; where places are seen, in whatever season, fewer are so far off
-_SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # from which on a session's views may be of a season that is odd
-_ODDEST_SEASON = 1.5  # times as strange as a view may be
+FAR_STD = 2.0  # standard deviations from the mean, beyond which a number of an encoding is far off
+_MOST_FAR = 3 / 16  # share of a view's numbers; where it shows a place, in whatever season, fewer are far off
+_SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # number and variety from which a session's views may be of an odd season
+_ODDEST_SEASON = 1.5  # times the strangeness from which a view shows nothing, up to which it may be of an odd season
 _FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
 
 
@@ -41,9 +41,9 @@ class Query:
     """One described view; or a batch of them, where every array has a leading axis [e] and all landmarks are ranked."""
 
     ranks: NDArray[np.float32]  # [r] float32, 1..r, of all landmarks
-    # [r] float32, smaller is nearer; None when a robot sent ranks alone
+    # [r] float32, smaller is nearer; None where a robot sent ranks alone
     dissimilarities: NDArray[np.float32] | None = None
-    encoding: NDArray[np.float32] | None = None  # [d] float32; None when a robot sent no encoding
+    encoding: NDArray[np.float32] | None = None  # [d] float32; None where a robot sent none
 
     @classmethod
     def uninformative(cls, n_landmarks: int) -> "Query":
@@ -52,14 +52,14 @@ class Query:
 
     @cached_property
     def products(self) -> NDArray[np.float32] | None:
-        """Products of unit vectors, from their squared distances; None where the dissimilarities are none such."""
+        """[r] products of unit vectors, where dissimilarities are their squared distances; None where they are none."""
         if self.dissimilarities is None or self.dissimilarities.min() < 0 or self.dissimilarities.max() > _FARTHEST:
             return None
         return np.asarray(1 - self.dissimilarities / 2, np.float32)
 
     @cached_property
     def is_informative(self) -> bool:
-        """Whether some landmark is nearer than another; a view that says nothing must not move a belief."""
+        """Whether some landmark is nearer than another; another view says nothing and must not move a belief."""
         return bool(self.ranks.min() < self.ranks.max())
 
     def at(self, rows: int | slice | NDArray[np.int64]) -> "Query":
@@ -89,8 +89,8 @@ DEFAULT_UPDATE = {
     Relevance.BRUTE_FORCE: UpdateRule.ADDITIVE_RECIPROCAL_RANK,
 }
 
-# What a relevance counts as a log-likelihood, where nobody learnt it. The h landmarks of a list are not independent
-# witnesses, so summed scores count by less than 1.
+# The factor that makes a relevance a log-likelihood, where a map has not learnt it. The h landmarks of a list are not
+# independent witnesses, so summed scores count by less than 1.
 DEFAULT_LIKELIHOOD_SCALE = {Relevance.COMPOSED: 12.0}
 OTHER_LIKELIHOOD_SCALE = 0.3
 
@@ -102,17 +102,18 @@ def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(mean_rank[place], np.float64)
 
 
-def strangeness(encodings: NDArray[np.floating], usual: Moments) -> NDArray[np.float64]:
-    """[...] which share of the numbers of encodings [..., d] is farther than two deviations from what is usual."""
-    far = np.abs(encodings - usual.mean) > FAR_STD * usual.std
+def strangeness(encodings: NDArray[np.floating], moments: Moments) -> NDArray[np.float64]:
+    """[...] the share of the numbers of encodings [..., d] that are over two standard deviations from the mean."""
+    far = np.abs(encodings - moments.mean) > FAR_STD * moments.std
     return np.asarray(far.mean(axis=-1))
 
 
 def most_strange(first: NDArray[np.float32], second: NDArray[np.float32] | None = None) -> float:
     """The strangeness from which on a view shows nothing of a route.
 
-    Noise, glare and the dark leave what an extractor shows of places, whichever season it is: 3 in 16 numbers far off,
-    and three deviations of what that share is by chance. Where a second season was stranger to the first, that counts.
+    Views of places, in whatever season, have fewer numbers far off than noise, glare and the dark do: at most 3 in 16,
+    and three standard deviations of that share by chance. Where a second season was stranger to the first, its own
+    strangeness is the least.
 
     Args:
         first: [n, d] encodings of the route.
@@ -124,60 +125,59 @@ def most_strange(first: NDArray[np.float32], second: NDArray[np.float32] | None 
     return max(by_default, float(np.quantile(strangeness(second, Moments.of(first)), 0.99)))
 
 
-def is_strange(encoding: NDArray[np.float32], usual: Moments, live: Moments | None, most: float) -> bool:
+def is_strange(encoding: NDArray[np.float32], map_moments: Moments, live: Moments | None, threshold: float) -> bool:
     """Whether a view shows nothing of a route.
 
-    A season may be stranger than `most`. Its views differ among themselves as the route's do, and noise hardly does:
-    where a session's did, they are judged by their own mean.
+    A season may be stranger than the threshold. Its views differ among themselves as the route's do, which those of
+    noise hardly do: where a session's views differ so, they are judged by their own mean.
 
     Args:
         encoding: [d].
-        usual: On the map.
-        live: The same with a session's views, which began as that.
+        map_moments: Of the map's encodings.
+        live: The same with a session's views added; None: there is no session.
+        threshold: The strangeness from which on a view shows nothing.
     """
-    seen = strangeness(encoding, usual)
-    if seen <= most or live is None or seen > _ODDEST_SEASON * most:
-        return bool(seen > most)
-    season = _season(usual, live)
-    return season is None or bool(strangeness(encoding, season) > most)
+    share = strangeness(encoding, map_moments)
+    if share <= threshold or live is None or share > _ODDEST_SEASON * threshold:
+        return bool(share > threshold)
+    season = _season(map_moments, live)
+    return season is None or bool(strangeness(encoding, season) > threshold)
 
 
-def _season(usual: Moments, live: Moments) -> Moments | None:
-    """What is usual for a session's own views, with the route's deviations; None where they are few or all alike."""
-    weight = live.weight - usual.weight
+def _season(map_moments: Moments, live: Moments) -> Moments | None:
+    """Mean of a session's own views with the deviations of the map's; None where they are few or all alike."""
+    weight = live.weight - map_moments.weight
     if weight < _SEASON_VIEWS:
         return None
-    mean, square = (
-        (after * live.weight - before * usual.weight) / weight
-        for after, before in ((live.mean, usual.mean), (live.square, usual.square))
-    )
-    variety = np.minimum((square - np.square(mean)) / np.square(usual.std), 2.0).mean()
+    mean = (live.mean * live.weight - map_moments.mean * map_moments.weight) / weight
+    square = (live.square * live.weight - map_moments.square * map_moments.weight) / weight
+    variety = np.minimum((square - np.square(mean)) / np.square(map_moments.std), 2.0).mean()
     if variety < _SEASON_VARIETY:
         return None
-    return replace(usual, mean=mean, square=np.square(mean) + np.square(usual.std))
+    return replace(map_moments, mean=mean, square=np.square(mean) + np.square(map_moments.std))
 
 
 def shows_nothing(blocks: Callable[[], Iterable[NDArray[np.float32]]]) -> NDArray[np.bool_]:
     """[n] which frames of a drive show nothing of its route: noise, glare, the dark.
 
     Args:
-        blocks: Gives its encodings [_, d] in blocks, however often it is asked.
+        blocks: Yields its encodings in blocks [_, d]; called twice.
     """
-    usual = Moments.of_blocks(blocks())
-    strange = [strangeness(block, usual) > most_strange(block) for block in blocks()]
-    return np.concatenate(strange) if strange else np.zeros(0, np.bool_)
+    moments = Moments.of_blocks(blocks())
+    masks = [strangeness(block, moments) > most_strange(block) for block in blocks()]
+    return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
 
 
 @dataclass(frozen=True)
 class LiveStatistics:
-    """Of whatever a robot sends; each kind of view is compared with views of its own kind alone."""
+    """Running statistics of a session's views, by what a robot sends; each kind is compared with its own."""
 
     ranks: LandmarkStatistics  # normal scores of ranked landmarks
     encodings: Moments | None = None  # [d]; None where encodings are not compared
     products: Moments | None = None  # [r] products of unit encodings with landmarks; None likewise
 
     def observing(self, query: Query, worth: float = 1.0) -> "LiveStatistics":
-        """With one view more, which counts in its own comparison; `worth` of one that saw little new is less than 1."""
+        """With one view more, which counts in its own comparison; `worth` is below 1 of one that saw little new."""
         if self.encodings is not None and query.encoding is not None:
             return LiveStatistics(self.ranks, self.encodings.observing(query.encoding, worth), self.products)
         if self.products is not None and query.products is not None:
@@ -185,7 +185,7 @@ class LiveStatistics:
         return LiveStatistics(self.ranks.observing(query.ranks, worth), self.encodings, self.products)
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All that changes, to be restored bit for bit."""
+        """The named arrays of what views change, from which `from_arrays` restores it bit for bit."""
         arrays = {}
         for name, moments in self._moments().items():
             arrays[name] = np.stack([moments.mean, moments.square])
@@ -193,7 +193,7 @@ class LiveStatistics:
         return arrays
 
     def from_arrays(self, arrays: dict[str, NDArray[np.float64]]) -> "LiveStatistics":
-        """What `to_arrays` of statistics like these gave; raises KeyError where an array is missing."""
+        """The statistics whose arrays `to_arrays` gave, on the same map; raises KeyError where one is missing."""
         restored: dict[str, Any] = {}
         for name, moments in self._moments().items():
             mean, square = arrays[name]
@@ -201,5 +201,5 @@ class LiveStatistics:
         return replace(self, **restored)
 
     def _moments(self) -> dict[str, Moments]:
-        named = {"ranks": self.ranks, "encodings": self.encodings, "products": self.products}
-        return {name: moments for name, moments in named.items() if moments is not None}
+        moments_by_name = {"ranks": self.ranks, "encodings": self.encodings, "products": self.products}
+        return {name: moments for name, moments in moments_by_name.items() if moments is not None}

@@ -12,7 +12,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.building import MapPlan, SeenTwice, composed_map, covers, listed, measured_dissimilarities, taught
+from deepsimbad.core.building import (
+    MapPlan,
+    SeenTwice,
+    composed_map,
+    covers,
+    listed_values,
+    measured_dissimilarities,
+    taught,
+)
 from deepsimbad.core.composed import (
     LEAST_SHARED_PLACES,
     SECOND_SEASON_WEIGHT,
@@ -314,7 +322,7 @@ def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
         {
             "lists": lists,
             "position_m": _on_route(map_, route.position_m),
-            "values": None if map_.values is None else listed(measured_dissimilarities(drive), lists),
+            "values": None if map_.values is None else listed_values(measured_dissimilarities(drive), lists),
             "encodings": None if map_.encodings is None else drive.encodings,
             "view_bits": bits,
             "coverage": chance,

@@ -306,7 +306,7 @@ class _Remap:
             self.progress.stage("train")
             q_values, learning = train_nnql(
                 built.rehearsal,
-                built.own,
+                built.map_drive,
                 built.second,
                 NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
                 self.progress.update,

@@ -313,7 +313,7 @@ def trained(config: NbvConfig, name: str, built: Built, on_progress: Callable[[f
     nnql = NnqlConfig(
         config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
     )
-    q_values, _ = train_nnql(built.rehearsal, built.own, built.second, nnql, on_progress, available_cores())
+    q_values, _ = train_nnql(built.rehearsal, built.map_drive, built.second, nnql, on_progress, available_cores())
     return Setup(name, replace(built.map, q_values=q_values), update, action_std_m)
 
 

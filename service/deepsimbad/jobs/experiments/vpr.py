@@ -186,11 +186,11 @@ def build_maps(
 def listed_anew(built: Built, list_length: int) -> Map:
     """The map with lists of another length, and landmarks moved for them: single views are compared by no more."""
     map_ = built.map
-    if map_.relevance is Relevance.COMPOSED and built.places is not None and built.chosen is not None:
-        prototypes = learnt_landmarks(built.places, built.chosen, list_length)
+    if map_.relevance is Relevance.COMPOSED and built.places is not None and built.initial_landmarks is not None:
+        prototypes = learnt_landmarks(built.places, built.initial_landmarks, list_length)
         lists = compose(built.places, prototypes, list_length)
         return replace(map_, lists=lists, landmark_model={**map_.landmark_model, "prototypes": prototypes})
-    listed = build_map(map_.relevance, built.own, list_length)
+    listed = build_map(map_.relevance, built.map_drive, list_length)
     return replace(listed, landmark_model=map_.landmark_model, actions_m=map_.actions_m)
 
 
