@@ -45,11 +45,11 @@ def served_bucket(root: Path) -> Iterator[Bucket]:
             if key or "delete" not in self.query:
                 super()._post_request(bucket, key)
                 return
-            done = ElementTree.Element("DeleteResult")
-            for named in ElementTree.fromstring(self._read_body()).findall(".//{*}Key"):
-                self._object_path(bucket, str(named.text)).unlink(missing_ok=True)
-                ElementTree.SubElement(ElementTree.SubElement(done, "Deleted"), "Key").text = named.text
-            self._send_xml(done)
+            deletions = ElementTree.Element("DeleteResult")
+            for element in ElementTree.fromstring(self._read_body()).findall(".//{*}Key"):
+                self._object_path(bucket, str(element.text)).unlink(missing_ok=True)
+                ElementTree.SubElement(ElementTree.SubElement(deletions, "Deleted"), "Key").text = element.text
+            self._send_xml(deletions)
 
     folder = root / BUCKET
     folder.mkdir()

@@ -16,8 +16,8 @@ EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 
 @pytest.fixture
 def catalog(tmp_path: Path) -> Iterator[Catalog]:
-    with Catalog.open(tmp_path / "data") as opened:
-        yield opened
+    with Catalog.open(tmp_path / "data") as new_catalog:
+        yield new_catalog
 
 
 @pytest.fixture

@@ -38,39 +38,39 @@ def contents(version: int) -> Map:
 
 
 def prepare(data_dir: Path) -> None:
-    """A domain to map and one to delete, both from before."""
+    """Make a domain to map and one to delete, which are there before the scenario begins."""
     with Catalog.open(data_dir) as catalog:
         for name in ("campus", "old"):
             catalog.create_domain(name, {}, False, [1])
         Traverse.create(data_dir, "old", "summer").close()
 
 
-def scenario(data_dir: Path, done: Callable[[str], None]) -> None:
+def scenario(data_dir: Path, report: Callable[[str], None]) -> None:
     """Upload, remap, activate, delete; tells after each thing that is acknowledged."""
     with Catalog.open(data_dir) as catalog:
         with Traverse.create(data_dir, "campus", "summer") as traverse:
-            done("traverse")
+            report("traverse")
             traverse.put_frames(frames())
-            done("frames")
+            report("frames")
         job = catalog.create_job("campus", "remap", {})
-        done("job")
+        report("job")
         version = catalog.begin_map("campus", {})
-        done("begun")
+        report("begun")
         write_map(catalog.building_path("campus", version), contents(version))
-        done("written")
+        report("written")
         digest, n_bytes = seal(catalog.building_path("campus", version), catalog.map_path("campus", version))
-        done("sealed")
+        report("sealed")
         catalog.seal_map("campus", version, digest, n_bytes, {})
-        done("noted")
+        report("noted")
         catalog.activate("campus", version, None)
-        done("active")
+        report("active")
         catalog.update_job(job.job_id, state="succeeded", result={"map_version": version})
-        done("finished")
+        report("finished")
         catalog.delete_domain("old")
-        done("deleted")
+        report("deleted")
 
 
-def check(data_dir: Path, done: list[str]) -> None:
+def check(data_dir: Path, steps: list[str]) -> None:
     """After the death: everything acknowledged is there, everything else is there whole or not at all."""
     with Catalog.open(data_dir) as catalog:
         catalog.discard_unfinished()
@@ -78,14 +78,14 @@ def check(data_dir: Path, done: list[str]) -> None:
         waiting = catalog.waiting_jobs()
 
         names = Traverse.list(data_dir, "campus")
-        expect(names == ["summer"] or (names == [] and "traverse" not in done), "the traverse")
+        expect(names == ["summer"] or (names == [] and "traverse" not in steps), "the traverse")
         if names:
             with Traverse.open(data_dir, "campus", "summer") as traverse:
                 n_frames = traverse.read().n_frames
-            expect(n_frames == N_FRAMES or (n_frames == 0 and "frames" not in done), "the batch")
+            expect(n_frames == N_FRAMES or (n_frames == 0 and "frames" not in steps), "the batch")
 
         maps = catalog.maps("campus")
-        expect(len(maps) == 1 or (maps == [] and "noted" not in done), "the version")
+        expect(len(maps) == 1 or (maps == [] and "noted" not in steps), "the version")
         for record in maps:
             expect(record.state in (MapState.SEALED, MapState.ACTIVE), "no version is half built")
             verify(catalog.map_path("campus", record.version), record.sha256 or "")
@@ -93,16 +93,16 @@ def check(data_dir: Path, done: list[str]) -> None:
         files = sorted(path.name for path in (data_dir / "domains/campus/maps").iterdir())
         expect(files == [f"{record.version:06d}.sqlite" for record in maps], f"no file is left over: {files}")
         active = catalog.domain("campus").active_version
-        expect(active == 1 or (active is None and "active" not in done), "the activation")
+        expect(active == 1 or (active is None and "active" not in steps), "the activation")
 
         jobs = [job.state for job in catalog.jobs()]
-        if "finished" in done:
+        if "finished" in steps:
             expect(jobs == [JobState.SUCCEEDED], "the finished job")
         else:
             expect(jobs in ([], [JobState.QUEUED], [JobState.SUCCEEDED]), "a job is lost or stays with the dead")
         expect(len(waiting) == jobs.count(JobState.QUEUED), "what is queued waits for the living")
         old = [domain.name for domain in catalog.domains()] == ["campus", "old"]
-        expect(not old or "deleted" not in done, "the deletion")
+        expect(not old or "deleted" not in steps, "the deletion")
         expect((data_dir / "domains/old").exists() == old, "rows and files go together")
         expect([path.name for path in (data_dir / "domains").glob(".*")] == [], "no grave is left")
 

@@ -99,13 +99,13 @@ def archive(original: Path, tmp_path: Path) -> Path:
 
 
 def test_everything_comes_back(furnished: Catalog, archive: Path, tmp_path: Path) -> None:
-    there = tmp_path / "there"
+    restored_dir = tmp_path / "there"
     shares: list[float] = []
-    report = restore(archive, there, shares.append)
+    report = restore(archive, restored_dir, shares.append)
     assert (report.n_files, report.release) == (6, "1.2")
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    with Catalog.open(there) as catalog, SessionStore.open(there) as store:
+    with Catalog.open(restored_dir) as catalog, SessionStore.open(restored_dir) as store:
         assert catalog.domains() == furnished.domains()
         assert len(catalog.discard_unfinished()) == 1, "the map that was being built"
         assert catalog.maps("campus") == furnished.maps("campus")[:2]
@@ -115,10 +115,13 @@ def test_everything_comes_back(furnished: Catalog, archive: Path, tmp_path: Path
             assert stat.S_IMODE(path.stat().st_mode) == 0o444
             assert read_map(path).version == record.version
         for name in ("summer", "winter"):
-            with Traverse.open(there, "campus", name) as here, Traverse.open(furnished.data_dir, "campus", name) as old:
-                assert (here.read().encodings == old.read().encodings).all()
+            with (
+                Traverse.open(restored_dir, "campus", name) as new,
+                Traverse.open(furnished.data_dir, "campus", name) as old,
+            ):
+                assert (new.read().encodings == old.read().encodings).all()
         assert store.find("robot").n_events == 3
-        Traverse.create(there, "empty", "new").close()
+        Traverse.create(restored_dir, "empty", "new").close()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["backup.tar", "data", "there"], "nothing is left beside"
 
 
@@ -137,14 +140,14 @@ def test_it_is_a_tar_file_with_a_manifest(archive: Path) -> None:
 
 def test_the_data_directory_is_left_as_it_was_and_no_file_is_replaced(furnished: Catalog, tmp_path: Path) -> None:
     furnished.close()
-    before = contents_of(furnished.data_dir)
+    old_contents = contents_of(furnished.data_dir)
     (tmp_path / "mine").write_text("precious")
     for file, error in ((tmp_path / "mine", ConflictError), (tmp_path / "nowhere" / "x", InvalidInputError)):
         with pytest.raises(error):
             back_up(furnished.data_dir, file, "0", silent)
     back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
     assert inspect(furnished.data_dir, silent) == Inspection(6, ())
-    assert contents_of(furnished.data_dir) == before
+    assert contents_of(furnished.data_dir) == old_contents
     assert (tmp_path / "mine").read_text() == "precious"
 
 
@@ -153,25 +156,25 @@ def test_a_cancelled_backup_or_restore_leaves_nothing(furnished: Catalog, archiv
         if share > 0.4:
             raise CancelledError("cancelled")
 
-    before = sorted(tmp_path.iterdir())
+    old_paths = sorted(tmp_path.iterdir())
     with pytest.raises(CancelledError):
         back_up(furnished.data_dir, tmp_path / "other.tar", "0", cancel)
     with pytest.raises(CancelledError):
         restore(archive, tmp_path / "there", cancel)
-    assert sorted(tmp_path.iterdir()) == before
+    assert sorted(tmp_path.iterdir()) == old_paths
 
 
 def test_what_is_damaged_is_named_and_not_backed_up(furnished: Catalog, tmp_path: Path) -> None:
     path = furnished.map_path("campus", 1)
-    whole = path.read_bytes()
+    content = path.read_bytes()
     path.chmod(0o644)
-    path.write_bytes(whole[:5000] + bytes([whole[5000] ^ 1]) + whole[5001:])
+    path.write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])
     with pytest.raises(DamagedMapError, match=r"map 1 of domain campus .* SHA-256 differs"):
         back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
     path.unlink()
     with pytest.raises(DamagedMapError, match=r"map 1 of domain campus .*000001\.sqlite is missing"):
         back_up(furnished.data_dir, tmp_path / "backup.tar", "0", silent)
-    path.write_bytes(whole)
+    path.write_bytes(content)
     traverse = furnished.data_dir / "domains/campus/traverses/winter.sqlite"
     traverse.write_bytes(traverse.read_bytes()[:8192])
     with pytest.raises(DamagedFileError, match=r"winter\.sqlite"):
@@ -180,18 +183,18 @@ def test_what_is_damaged_is_named_and_not_backed_up(furnished: Catalog, tmp_path
 
 
 def test_a_backup_that_was_changed_or_cut_short_is_refused(archive: Path, tmp_path: Path) -> None:
-    whole = archive.read_bytes()
+    content = archive.read_bytes()
     with tarfile.open(archive) as tar:
         members = [(info.offset_data, info.size) for info in tar if info.name != "manifest.json"]
         manifest_at = tar.getmember("manifest.json").offset
     rng = np.random.default_rng(0)
     places = [0, 100, *(offset + int(rng.integers(size)) for offset, size in members for _ in range(4))]
     for at in places:
-        archive.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << rng.integers(8))]) + whole[at + 1 :])
+        archive.write_bytes(content[:at] + bytes([content[at] ^ (1 << rng.integers(8))]) + content[at + 1 :])
         with pytest.raises(InvalidArchiveError):
             restore(archive, tmp_path / "there", silent)
-    for length in (0, 1, 511, 1024, 2048, len(whole) // 2, manifest_at, manifest_at + 600):
-        archive.write_bytes(whole[:length])
+    for length in (0, 1, 511, 1024, 2048, len(content) // 2, manifest_at, manifest_at + 600):
+        archive.write_bytes(content[:length])
         with pytest.raises(InvalidArchiveError):
             restore(archive, tmp_path / "there", silent)
     archive.unlink()
@@ -200,11 +203,11 @@ def test_a_backup_that_was_changed_or_cut_short_is_refused(archive: Path, tmp_pa
     assert not (tmp_path / "there").exists()
 
 
-def forged(tmp_path: Path, names: list[str], about: dict[str, Any], kind: bytes = tarfile.REGTYPE) -> Path:
+def forged(tmp_path: Path, names: list[str], fields: dict[str, Any], kind: bytes = tarfile.REGTYPE) -> Path:
     """A backup whose digests are all right, by someone who means harm."""
     content = b"x" * 700
     members = [{"name": name, "bytes": 700, "sha256": hashlib.sha256(content).hexdigest()} for name in names]
-    manifest = {"format": "deepsimbad-backup", "format_version": 1, **about, "files": members}
+    manifest = {"format": "deepsimbad-backup", "format_version": 1, **fields, "files": members}
     with tarfile.open(tmp_path / "forged.tar", "w") as tar:
         for name, packed in [*((name, content) for name in names), ("manifest.json", json.dumps(manifest).encode())]:
             info = tarfile.TarInfo(name)
@@ -233,10 +236,10 @@ def forged(tmp_path: Path, names: list[str], about: dict[str, Any], kind: bytes 
 def test_a_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
     assert migrations_of(name) is None
     path = forged(tmp_path, ["catalog.sqlite", name], {})
-    before = sorted(tmp_path.rglob("*"))
+    old_paths = sorted(tmp_path.rglob("*"))
     with pytest.raises(InvalidArchiveError, match="has no place in it"):
         restore(path, tmp_path / "there", silent)
-    assert sorted(tmp_path.rglob("*")) == before
+    assert sorted(tmp_path.rglob("*")) == old_paths
 
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE])
@@ -251,9 +254,9 @@ def test_what_is_no_backup_is_refused(tmp_path: Path) -> None:
         (["catalog.sqlite"], {"format": "other"}, "no backup of a data directory"),
         (["catalog.sqlite"], {"format_version": 2}, "newer release"),
     ]
-    for names, about, message in wrong:
+    for names, fields, message in wrong:
         with pytest.raises(InvalidArchiveError, match=message):
-            restore(forged(tmp_path, names, about), tmp_path / "there", silent)
+            restore(forged(tmp_path, names, fields), tmp_path / "there", silent)
     with pytest.raises(DamagedFileError, match=r"catalog\.sqlite"):
         restore(forged(tmp_path, ["catalog.sqlite"], {}), tmp_path / "there", silent)
     with tarfile.open(tmp_path / "plain.tar", "w") as tar:
@@ -289,20 +292,22 @@ def repacked(archive: Path, name: str, change: Callable[[Path], None]) -> None:
         ("domains/campus/maps/000001.sqlite", "posting"),
     ],
 )
-@pytest.mark.parametrize("what", ["VIEW strange AS SELECT 1", "TRIGGER strange AFTER INSERT ON {} BEGIN SELECT 1; END"])
+@pytest.mark.parametrize(
+    "definition", ["VIEW strange AS SELECT 1", "TRIGGER strange AFTER INSERT ON {} BEGIN SELECT 1; END"]
+)
 def test_a_backup_that_would_run_what_its_maker_wrote_is_refused(
-    archive: Path, tmp_path: Path, name: str, table: str, what: str
+    archive: Path, tmp_path: Path, name: str, table: str, definition: str
 ) -> None:
     repacked(archive, name, lambda path: None)
     restore(archive, tmp_path / "sound", silent)
-    repacked(archive, name, lambda path: altered(path, f"CREATE {what.format(table)}"))
+    repacked(archive, name, lambda path: altered(path, f"CREATE {definition.format(table)}"))
     with pytest.raises(DamagedFileError, match="no release writes"):
         restore(archive, tmp_path / "there", silent)
     assert not (tmp_path / "there").exists()
 
 
 def test_a_backup_of_an_older_release_comes_back(archive: Path, tmp_path: Path) -> None:
-    """They held a digest of all that lies before it as their last member."""
+    """Its last member is a digest of all that lies before it."""
     with tarfile.open(archive, "a") as tar:
         info = tarfile.TarInfo("archive.sha256")
         info.size = 64
@@ -313,11 +318,11 @@ def test_a_backup_of_an_older_release_comes_back(archive: Path, tmp_path: Path) 
 def test_only_an_empty_folder_is_restored_into(archive: Path, furnished: Catalog, tmp_path: Path) -> None:
     with pytest.raises(ConflictError, match="not empty"):
         restore(archive, furnished.data_dir, silent)
-    there = tmp_path / "there"
-    with service_lock(there, "127.0.0.1:8000"), pytest.raises(DataDirInUseError):
-        restore(archive, there, silent)
-    (there / "service.lock").touch()  # of a service that was killed
-    restore(archive, there, silent)
+    data_dir = tmp_path / "there"
+    with service_lock(data_dir, "127.0.0.1:8000"), pytest.raises(DataDirInUseError):
+        restore(archive, data_dir, silent)
+    (data_dir / "service.lock").touch()  # of a service that was killed
+    restore(archive, data_dir, silent)
     (tmp_path / "file").write_text("x")
     with pytest.raises(UnavailableError, match="should be"):
         restore(archive, tmp_path / "file", silent)
@@ -340,46 +345,46 @@ def at_half(act: Callable[[], None]) -> Callable[[float], None]:
 
 
 def test_no_service_starts_in_a_folder_that_is_restored_into(archive: Path, tmp_path: Path) -> None:
-    there, refused = tmp_path / "there", []
+    data_dir, refused = tmp_path / "there", []
 
     def start() -> None:
-        with pytest.raises(DataDirInUseError), service_lock(there, "127.0.0.1:8000"):
+        with pytest.raises(DataDirInUseError), service_lock(data_dir, "127.0.0.1:8000"):
             pass
         refused.append(True)
 
-    restore(archive, there, at_half(start))
+    restore(archive, data_dir, at_half(start))
     assert refused
-    with service_lock(there, "127.0.0.1:8000"), Catalog.open(there) as catalog:
+    with service_lock(data_dir, "127.0.0.1:8000"), Catalog.open(data_dir) as catalog:
         assert len(catalog.domains()) == 2
 
 
 def test_a_folder_that_a_command_began_to_use_meanwhile_is_left_alone(archive: Path, tmp_path: Path) -> None:
-    there = tmp_path / "there"
+    data_dir = tmp_path / "there"
     with pytest.raises(ConflictError, match="not empty any more"):
-        restore(archive, there, at_half(lambda: Catalog.open(there).close()))
-    assert not (there / "domains").exists(), "nothing is published by half"
-    assert not (there / "sessions.sqlite").exists()
-    with Catalog.open(there) as catalog:
+        restore(archive, data_dir, at_half(lambda: Catalog.open(data_dir).close()))
+    assert not (data_dir / "domains").exists(), "nothing is published by half"
+    assert not (data_dir / "sessions.sqlite").exists()
+    with Catalog.open(data_dir) as catalog:
         assert catalog.domains() == []
 
 
 def test_a_restore_that_was_killed_is_begun_anew(archive: Path, tmp_path: Path) -> None:
-    there = tmp_path / "there"
-    (there / ".restoring").mkdir(parents=True)
-    (there / "domains/campus").mkdir(parents=True)  # it had begun to publish; the catalog comes last
+    data_dir = tmp_path / "there"
+    (data_dir / ".restoring").mkdir(parents=True)
+    (data_dir / "domains/campus").mkdir(parents=True)  # it had begun to publish; the catalog comes last
     with pytest.raises(DamagedFileError, match="missing beside a folder of domains"):
-        Catalog.open(there)
-    (there / "other").touch()
+        Catalog.open(data_dir)
+    (data_dir / "other").touch()
     with pytest.raises(ConflictError, match="not empty"):
-        restore(archive, there, silent)
-    (there / "other").unlink()
-    restore(archive, there, silent)
-    assert not (there / ".restoring").exists()
-    with Catalog.open(there) as catalog:
+        restore(archive, data_dir, silent)
+    (data_dir / "other").unlink()
+    restore(archive, data_dir, silent)
+    assert not (data_dir / ".restoring").exists()
+    with Catalog.open(data_dir) as catalog:
         assert len(catalog.domains()) == 2
-    (there / ".restoring").mkdir()
+    (data_dir / ".restoring").mkdir()
     with pytest.raises(ConflictError, match="not empty"):
-        restore(archive, there, silent)
+        restore(archive, data_dir, silent)
 
 
 def test_a_folder_that_is_made_is_its_owners_alone_and_one_that_was_there_keeps_its_rights(
@@ -387,9 +392,9 @@ def test_a_folder_that_is_made_is_its_owners_alone_and_one_that_was_there_keeps_
 ) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine").chmod(0o750)
-    for there in (tmp_path / "above" / "there", tmp_path / "mine"):
-        restore(archive, there, silent)
-        Catalog.open(there).close()
+    for data_dir in (tmp_path / "above" / "there", tmp_path / "mine"):
+        restore(archive, data_dir, silent)
+        Catalog.open(data_dir).close()
     folders = (tmp_path / "above" / "there", furnished.data_dir, tmp_path / "mine")
     assert [stat.S_IMODE(folder.stat().st_mode) for folder in folders] == [0o700, 0o700, 0o750]
 
@@ -440,12 +445,12 @@ def test_a_file_that_others_write_to_is_read_as_it_stands(furnished: Catalog, ma
 def test_what_is_damaged_is_named_and_the_rest_is_read_all_the_same(furnished: Catalog, name: str) -> None:
     furnished.close()
     path = furnished.data_dir / name
-    whole = path.read_bytes()
-    page = len(whole) // 4096 // 2 * 4096
+    content = path.read_bytes()
+    page = len(content) // 4096 // 2 * 4096
     for damage in (
-        whole[:100] + bytes(50) + whole[150:],
-        whole[:page] + bytes(600) + whole[page + 600 :],
-        whole[:4096],
+        content[:100] + bytes(50) + content[150:],
+        content[:page] + bytes(600) + content[page + 600 :],
+        content[:4096],
     ):
         path.chmod(0o644)
         path.write_bytes(damage)

@@ -155,10 +155,10 @@ def test_of_many_swaps_at_once_one_wins(campus: Catalog) -> None:
     start = threading.Barrier(len(versions))
 
     def swap(version: int) -> None:
-        with Catalog.open(campus.data_dir) as own:  # a connection of its own, as another process has
+        with Catalog.open(campus.data_dir) as catalog:  # a connection of its own, as another process has
             start.wait()
             try:
-                own.activate("campus", version, None)
+                catalog.activate("campus", version, None)
                 won.append(version)
             except LostActivationError as error:
                 lost.append(error)
@@ -181,11 +181,11 @@ def test_the_life_of_a_job(campus: Catalog) -> None:
     assert job.started_at is not None
     assert job.finished_at is None
     assert campus.update_job(job.job_id, eta_s=float("inf")).eta_s is None
-    done = campus.update_job(job.job_id, state=JobState.CANCELLED, error={"code": "cancelled"})
-    assert done.finished_at is not None
-    assert done.error == {"code": "cancelled"}
-    late = campus.update_job(job.job_id, state="running", progress=0.9)
-    assert late == done == campus.job(job.job_id)
+    cancelled_job = campus.update_job(job.job_id, state=JobState.CANCELLED, error={"code": "cancelled"})
+    assert cancelled_job.finished_at is not None
+    assert cancelled_job.error == {"code": "cancelled"}
+    late_job = campus.update_job(job.job_id, state="running", progress=0.9)
+    assert late_job == cancelled_job == campus.job(job.job_id)
     second = campus.create_job("campus", "remap", {})
     assert [record.job_id for record in campus.jobs()] == [job.job_id, second.job_id]
     assert campus.jobs("campus") == campus.jobs()
@@ -196,11 +196,11 @@ def test_jobs_of_two_catalogs_are_one_list_in_the_order_of_their_making(
 ) -> None:
     with Catalog.open(tmp_path / "other") as other:
         other.create_domain("city", EVALUATOR, False, [1])
-        made = []
+        job_ids = []
         for catalog, domain in 2 * [(campus, "campus"), (other, "city")]:
-            made.append(catalog.create_job(domain, "remap", {}).job_id)
-        both = [*campus.numbered_jobs(None, None, 9), *other.numbered_jobs(None, None, 9)]
-        assert [job.job_id for _, job in sorted(both, key=lambda entry: entry[0])] == made
+            job_ids.append(catalog.create_job(domain, "remap", {}).job_id)
+        numbered_jobs = [*campus.numbered_jobs(None, None, 9), *other.numbered_jobs(None, None, 9)]
+        assert [job.job_id for _, job in sorted(numbered_jobs, key=lambda entry: entry[0])] == job_ids
     monkeypatch.setattr("time.time", lambda: 0.0)  # a clock that was set back
     last = campus.create_job("campus", "remap", {}).job_id
     assert campus.newest_jobs(None, None, 1).records[0].job_id == campus.waiting_jobs()[-1] == last
@@ -239,10 +239,10 @@ def test_a_damaged_catalog_gives_named_errors_alone(campus: Catalog) -> None:
     campus.create_job("campus", "remap", {"a": 1})
     campus.close()
     path = campus.data_dir / "catalog.sqlite"
-    whole = path.read_bytes()
+    content = path.read_bytes()
     n_named = 0
-    for at in [*range(0, 100, 3), *range(100, len(whole), 307)]:
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :])
+    for at in [*range(0, 100, 3), *range(100, len(content), 307)]:
+        path.write_bytes(content[:at] + bytes([content[at] ^ 0x55]) + content[at + 1 :])
         try:
             read_everything(campus.data_dir)
         except DeepSimbadError:
@@ -250,8 +250,8 @@ def test_a_damaged_catalog_gives_named_errors_alone(campus: Catalog) -> None:
         for suffix in ("-wal", "-shm"):
             path.with_name(path.name + suffix).unlink(missing_ok=True)
     assert n_named > 20
-    for length in [0, 1, 511, *range(4096, len(whole), 4096)]:
-        path.write_bytes(whole[:length])
+    for length in [0, 1, 511, *range(4096, len(content), 4096)]:
+        path.write_bytes(content[:length])
         with pytest.raises(DamagedFileError):
             read_everything(campus.data_dir)
 
@@ -267,13 +267,13 @@ def test_a_catalog_that_was_removed_meanwhile_takes_no_more(campus: Catalog) -> 
 
 
 def test_who_reads_does_not_wait_for_who_writes(campus: Catalog) -> None:
-    writing, done = threading.Event(), threading.Event()
+    writing, end = threading.Event(), threading.Event()
 
     def write() -> None:
         with campus._writing() as db:
             db.execute("UPDATE domain SET closed = 1")
             writing.set()
-            done.wait(60)
+            end.wait(60)
 
     thread = threading.Thread(target=write)
     thread.start()
@@ -282,7 +282,7 @@ def test_who_reads_does_not_wait_for_who_writes(campus: Catalog) -> None:
         assert [record.closed for record in campus.domains()] == [False]
         assert campus.keys() == []
     finally:
-        done.set()
+        end.set()
         thread.join()
     assert campus.domain("campus").closed
 
@@ -290,12 +290,12 @@ def test_who_reads_does_not_wait_for_who_writes(campus: Catalog) -> None:
 def test_others_write_while_the_files_of_a_deleted_domain_go(campus: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     remove = shutil.rmtree
 
-    def slowly(path: Path, **how: Any) -> None:
+    def slowly(path: Path, **options: Any) -> None:
         monkeypatch.setattr(durable.shutil, "rmtree", remove)
         with Catalog.open(campus.data_dir) as other:
             other.create_domain("meanwhile", EVALUATOR, False, [1])
             other.create_domain("campus", EVALUATOR, True, [1])
-        remove(path, **how)
+        remove(path, **options)
 
     monkeypatch.setattr(durable.shutil, "rmtree", slowly)
     campus.delete_domain("campus")
@@ -307,17 +307,17 @@ def test_a_settled_map_waits_for_a_removal_under_way(campus: Catalog) -> None:
     """Who pins a version and then finds it here keeps it: so it must not look while it is being removed."""
     sealed(campus)
     campus.activate("campus", sealed(campus), ANY)
-    asked, go_on = threading.Event(), threading.Event()
+    question, go_on = threading.Event(), threading.Event()
     is_removed: list[bool] = []
 
     def is_pinned() -> bool:
-        asked.set()
+        question.set()
         assert go_on.wait(60)
         return False
 
     removing = threading.Thread(target=lambda: campus.remove_map("campus", 1, is_pinned))
     removing.start()
-    assert asked.wait(60)
+    assert question.wait(60)
     looking = threading.Thread(target=lambda: is_removed.append(campus.settled_map("campus", 1).removed_at is not None))
     looking.start()
     assert campus.map("campus", 1).removed_at is None  # a plain look does not wait
@@ -400,17 +400,17 @@ def test_only_the_maps_of_dead_processes_are_discarded(campus: Catalog) -> None:
         with pytest.raises(TraverseInUseError):
             campus.delete_domain("campus")
         child.send_signal(signal.SIGKILL)
-    own = campus.begin_map("campus", {})
+    own_version = campus.begin_map("campus", {})
     assert campus.discard_abandoned_maps() == [], "while anybody builds one of the domain nobody can tell"
-    campus.discard_map("campus", own)
+    campus.discard_map("campus", own_version)
     assert campus.discard_unfinished() == [f"discarded the unfinished map {version} of domain campus"]
     assert campus.maps("campus") == []
     assert list((campus.data_dir / "domains/campus/maps").iterdir()) == []
     assert campus.discard_unfinished() == []
 
 
-@pytest.mark.parametrize(("n_starts", "then"), [(1, JobState.QUEUED), (2, JobState.QUEUED), (3, JobState.FAILED)])
-def test_a_job_is_started_three_times_at_most(campus: Catalog, n_starts: int, then: JobState) -> None:
+@pytest.mark.parametrize(("n_starts", "state"), [(1, JobState.QUEUED), (2, JobState.QUEUED), (3, JobState.FAILED)])
+def test_a_job_is_started_three_times_at_most(campus: Catalog, n_starts: int, state: JobState) -> None:
     waits, runs = (campus.create_job("campus", "remap", {}).job_id for _ in range(2))
     for _ in range(n_starts - 1):
         campus.start_job(runs)
@@ -422,14 +422,14 @@ def test_a_job_is_started_three_times_at_most(campus: Catalog, n_starts: int, th
     (line,) = campus.discard_unfinished()
     assert runs in line
     job = campus.job(runs)
-    assert (job.state, job.n_starts, job.eta_s) == (then, n_starts, None)
-    if then is JobState.FAILED:
-        why = "it was started 3 times and the service died each time"
-        assert job.error == {"code": "job_interrupted", "message": why, "n_starts": 3}
+    assert (job.state, job.n_starts, job.eta_s) == (state, n_starts, None)
+    if state is JobState.FAILED:
+        message = "it was started 3 times and the service died each time"
+        assert job.error == {"code": "job_interrupted", "message": message, "n_starts": 3}
         assert job.finished_at is not None
     else:
         assert (job.stage, job.progress, job.error, job.finished_at) == (None, 0, None, None)
-    assert campus.waiting_jobs() == ([waits, runs] if then is JobState.QUEUED else [waits])
+    assert campus.waiting_jobs() == ([waits, runs] if state is JobState.QUEUED else [waits])
     assert campus.discard_unfinished() == []
 
 

@@ -22,18 +22,19 @@ from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, table_
 MakeMap = Callable[..., Map]
 
 
-def same(left: Map, right: Map) -> bool:
-    """All alike, the experience to half of one of 65,535 steps from the lowest to the highest."""
-    ours, theirs = ({**map_.arrays(), **map_.landmark_model} for map_ in (left, right))
-    if left.document() != right.document() or ours.keys() != theirs.keys():
+def is_equal(left: Map, right: Map) -> bool:
+    """Whether two maps are equal, their Q-values within half of one of 65,535 steps from the lowest to the highest."""
+    left_arrays, right_arrays = ({**map_.arrays(), **map_.landmark_model} for map_ in (left, right))
+    if left.document() != right.document() or left_arrays.keys() != right_arrays.keys():
         return False
-    for name, array in ours.items():
+    for name, array in left_arrays.items():
         steps = (float(array.max()) - float(array.min())) / 65_535 if name == "q_values" else 0.0
         is_text = array.dtype.kind == "U"
         is_alike = (
-            np.array_equal(array, theirs[name], equal_nan=not is_text) or np.abs(array - theirs[name]).max() <= steps
+            np.array_equal(array, right_arrays[name], equal_nan=not is_text)
+            or np.abs(array - right_arrays[name]).max() <= steps
         )
-        if array.dtype != theirs[name].dtype or not is_alike:
+        if array.dtype != right_arrays[name].dtype or not is_alike:
             return False
     return True
 
@@ -70,7 +71,7 @@ def test_a_map_comes_back_exactly_and_frozen(make_map: MakeMap, tmp_path: Path) 
             name: np.asarray(array, np.asarray(array).dtype.newbyteorder("<"))
             for name, array in contents.landmark_model.items()
         }
-        assert same(replace(contents, landmark_model=little_endian), back)
+        assert is_equal(replace(contents, landmark_model=little_endian), back)
         assert (back.n_landmarks, back.list_length, back.n_images) == (
             contents.config["n_landmarks"],
             4,
@@ -120,21 +121,21 @@ def test_a_failed_or_cancelled_write_leaves_nothing(make_map: MakeMap, tmp_path:
     path = tmp_path / "map"
     with pytest.raises(InvalidInputError, match="numbers"):
         write_map(path, make_map(landmark_model={"words": np.array(["a"])}))
-    seen: list[float] = []
+    shares: list[float] = []
 
     def cancel(progress: float) -> None:
-        seen.append(progress)
+        shares.append(progress)
         if progress > 0.5:
             raise CancelledError("asked to stop")
 
     with pytest.raises(CancelledError):
         write_map(path, make_map(), cancel)
-    assert seen == sorted(seen)
+    assert shares == sorted(shares)
     with pytest.raises(UnavailableError):
         write_map(tmp_path / "no folder" / "map", make_map())
     assert list(tmp_path.iterdir()) == []
-    write_map(path, make_map(), seen.append)
-    assert seen[-1] == 1.0
+    write_map(path, make_map(), shares.append)
+    assert shares[-1] == 1.0
 
 
 def test_every_flipped_byte_is_seen_or_harmless(make_map: MakeMap, tmp_path: Path) -> None:
@@ -142,17 +143,17 @@ def test_every_flipped_byte_is_seen_or_harmless(make_map: MakeMap, tmp_path: Pat
     expected = everything(make_map)
     expected = replace(expected, landmark_model={"prototypes": expected.landmark_model["prototypes"]})
     write_map(path, expected)
-    whole = path.read_bytes()
+    content = path.read_bytes()
     generator = np.random.default_rng(0)
     (block,) = pack_lists(expected.lists, expected.n_landmarks, expected.landmark_model["prototypes"])
-    position, index = whole.index(expected.position_m[20:40].tobytes()), whole.index(block[:40])
+    position, index = content.index(expected.position_m[20:40].tobytes()), content.index(block[:40])
     places = [*range(0, 100, 2), position + 3, *range(index, index + 40)]
-    places += generator.integers(0, len(whole), 400).tolist()
+    places += generator.integers(0, len(content), 400).tolist()
     n_seen = 0
     for at in places:
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << int(generator.integers(8)))]) + whole[at + 1 :])
+        path.write_bytes(content[:at] + bytes([content[at] ^ (1 << int(generator.integers(8)))]) + content[at + 1 :])
         try:
-            assert same(expected, read_map(path)), f"byte {at} changed what was read"
+            assert is_equal(expected, read_map(path)), f"byte {at} changed what was read"
             table_bytes(path)
         except (DamagedMapError, UnavailableError):
             n_seen += 1
@@ -164,7 +165,7 @@ def test_files_that_are_no_maps_are_damaged_maps(make_map: MakeMap, tmp_path: Pa
     with pytest.raises(DamagedMapError, match="missing"):
         read_map(path)
     write_map(path, make_map())
-    whole = path.read_bytes()
+    map_bytes = path.read_bytes()
     with Catalog.open(tmp_path / "data"):
         pass
     foreign = (tmp_path / "data/catalog.sqlite").read_bytes()
@@ -172,12 +173,12 @@ def test_files_that_are_no_maps_are_damaged_maps(make_map: MakeMap, tmp_path: Pa
     with sqlite3.connect(unmarked) as connection:
         connection.execute("CREATE TABLE map (id)")
     connection.close()
-    contents = [b"", b"x", b"GIF89a" * 1000, whole[:99], foreign, unmarked.read_bytes()]
-    contents += [whole[:length] for length in range(4096, len(whole), 4096)]
+    contents = [b"", b"x", b"GIF89a" * 1000, map_bytes[:99], foreign, unmarked.read_bytes()]
+    contents += [map_bytes[:length] for length in range(4096, len(map_bytes), 4096)]
     for content in contents:
         path.write_bytes(content)
         for read in (read_map, index_bytes):
-            if read is index_bytes and content[:99] == whole[:99]:
+            if read is index_bytes and content[:99] == map_bytes[:99]:
                 continue  # page counts of a file that lost its end may still stand
             with pytest.raises(DamagedMapError):
                 read(path)
@@ -272,16 +273,16 @@ def test_a_changed_file_fails_its_digest(make_map: MakeMap, tmp_path: Path) -> N
     write_map(tmp_path / "a", make_map())
     final = tmp_path / "a.sqlite"
     digest, n_bytes = seal(tmp_path / "a", final)
-    whole = final.read_bytes()
+    content = final.read_bytes()
     for at in range(0, n_bytes, 997):
         final.chmod(0o644)
-        final.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        final.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
         with pytest.raises(DamagedMapError):
             verify(final, digest)
     with pytest.raises(DamagedMapError, match="SHA-256 differs"):
         adopt(final, tmp_path / "b.sqlite", digest)
     assert {path.name for path in tmp_path.iterdir()} == {"a.sqlite"}
-    final.write_bytes(whole[:-1])
+    final.write_bytes(content[:-1])
     with pytest.raises(DamagedMapError):
         verify(final, digest)
     final.unlink()
@@ -294,12 +295,12 @@ def test_what_cannot_be_read_back_is_not_sealed(make_map: MakeMap, tmp_path: Pat
     with pytest.raises(UnavailableError):
         seal(building, final)
     write_map(building, make_map())
-    whole = building.read_bytes()
-    damaged_at = whole.index(make_map().position_m[20:40].tobytes()) + 100
+    map_bytes = building.read_bytes()
+    damaged_at = map_bytes.index(make_map().position_m[20:40].tobytes()) + 100
     for content in (
         b"nothing of the kind" * 500,
-        whole[: len(whole) // 2],
-        whole[:damaged_at] + bytes([whole[damaged_at] ^ 1]) + whole[damaged_at + 1 :],
+        map_bytes[: len(map_bytes) // 2],
+        map_bytes[:damaged_at] + bytes([map_bytes[damaged_at] ^ 1]) + map_bytes[damaged_at + 1 :],
     ):
         building.write_bytes(content)
         with pytest.raises(DamagedMapError):
@@ -323,7 +324,7 @@ try:
 except UnavailableError as error:
     print(error.hints["reason"])
 """
-    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True, capture_output=True, text=True)
-    assert done.stdout.strip() in ("disk_full", "io_error")
+    process = subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True, capture_output=True, text=True)
+    assert process.stdout.strip() in ("disk_full", "io_error")
     assert [path.name for path in tmp_path.iterdir()] == ["000001.building"]
     seal(tmp_path / "000001.building", tmp_path / "000001.sqlite")

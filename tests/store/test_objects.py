@@ -17,10 +17,10 @@ from tests.store.bucket import Bucket, served_bucket
 def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bucket]:
     root = tmp_path / "s3"
     root.mkdir()
-    with served_bucket(root) as served:
-        for name, value in served.environment.items():
+    with served_bucket(root) as new_bucket:
+        for name, value in new_bucket.environment.items():
             monkeypatch.setenv(name, value)
-        yield served
+        yield new_bucket
 
 
 @pytest.fixture(params=["s3", "folder"])
@@ -55,10 +55,10 @@ def test_an_object_is_written_whole_and_read_as_it_was(objects: Objects, tmp_pat
 def test_of_many_who_create_an_object_at_once_one_does(objects: Objects) -> None:
     start, wrote = threading.Barrier(8), []
 
-    def create(mine: bytes) -> None:
+    def create(content: bytes) -> None:
         start.wait()
-        if objects.create("log/1", mine):
-            wrote.append(mine)
+        if objects.create("log/1", content):
+            wrote.append(content)
 
     threads = [threading.Thread(target=create, args=[b"%d" % number]) for number in range(8)]
     for thread in threads:
@@ -84,18 +84,18 @@ def test_a_bucket_that_is_gone_and_credentials_that_are_refused_are_named(
     objects.put("a", b"1")
     shutil.rmtree(bucket.folder)
     for ask in (lambda: objects.get("a"), lambda: objects.create("b", b""), lambda: list(objects.names("maps/"))):
-        with pytest.raises(UnavailableError, match="no such bucket") as gone:
+        with pytest.raises(UnavailableError, match="no such bucket") as failure:
             ask()
-        assert gone.value.hints["reason"] == "no_bucket"
+        assert failure.value.hints["reason"] == "no_bucket"
 
 
 def test_a_store_that_nobody_listens_for_is_unreachable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = tmp_path / "s3"
     root.mkdir()
-    with served_bucket(root) as served:
-        for name, value in served.environment.items():
+    with served_bucket(root) as bucket:
+        for name, value in bucket.environment.items():
             monkeypatch.setenv(name, value)
-        objects = Objects.open(served.url)
+        objects = Objects.open(bucket.url)
     with pytest.raises(UnavailableError) as unreachable:
         objects.get("a")
     assert unreachable.value.hints["reason"] == "unreachable"

@@ -24,8 +24,8 @@ RANKS = np.array([1, 2.5, 2.5, 4], np.float32)
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[SessionStore]:
-    with SessionStore.open(tmp_path) as opened:
-        yield opened
+    with SessionStore.open(tmp_path) as new_store:
+        yield new_store
 
 
 def observed(sequence: int, **changes: object) -> ObservedRow:
@@ -82,16 +82,16 @@ def test_ranks_of_any_map_fit(store: SessionStore, n_landmarks: int) -> None:
 
 def test_a_sequence_number_or_key_is_taken_once(store: SessionStore) -> None:
     number = store.create(RECORD).result().number
-    named = IdempotencyKey("k", b"d")
-    store.append(number, observed(1, idempotency=named), 1.0).result()
+    idempotency_key = IdempotencyKey("k", b"d")
+    store.append(number, observed(1, idempotency=idempotency_key), 1.0).result()
     with pytest.raises(InvalidInputError):
         store.append(number, observed(1), 1.0).result()
     with pytest.raises(InvalidInputError):
-        store.append(number, observed(2, idempotency=named), 1.0).result()
+        store.append(number, observed(2, idempotency=idempotency_key), 1.0).result()
     assert store.find_observation(number, "k") == (1, b"d")
     assert store.find_observation(number, "other") is None
     other = store.create(replace(RECORD, session_id="s2")).result().number
-    store.append(other, observed(1, idempotency=named), 1.0).result()  # keys are a session's own
+    store.append(other, observed(1, idempotency=idempotency_key), 1.0).result()  # keys are a session's own
     assert len(store.history(number, 9)[1]) == 1
 
 
@@ -170,9 +170,9 @@ def test_living_sessions_are_listed_page_by_page_newest_first(store: SessionStor
     store.append(numbers[1], observed(3, expires_at=400.0), 103.0).result()
     store.end(numbers[4], "deleted", 104.0).result()
 
-    def names(domain: str | None, before: int | None, limit: int, at: float) -> tuple[list[str], int | None]:
-        page = store.newest_living(domain, before, limit, at)
-        return [listed.session.session_id for listed in page.records], page.last_key
+    def names(domain: str | None, last_key: int | None, limit: int, time_s: float) -> tuple[list[str], int | None]:
+        page = store.newest_living(domain, last_key, limit, time_s)
+        return [entry.session.session_id for entry in page.records], page.last_key
 
     assert names(None, None, 10, 150.0) == (["s5", "s3", "s2", "s1", "s0"], None)
     assert names(None, None, 2, 150.0) == (["s5", "s3"], numbers[3])
@@ -181,8 +181,8 @@ def test_living_sessions_are_listed_page_by_page_newest_first(store: SessionStor
     assert names("campus", numbers[3], 2, 150.0) == (["s1"], None)
     assert names("nowhere", None, 2, 150.0) == ([], None)
     assert names(None, None, 10, 250.0) == (["s1"], None)  # the others have expired, though nobody has looked yet
-    (listed,) = store.newest_living(None, None, 10, 250.0).records
-    assert (listed.n_observations, listed.session.n_events, listed.session.expires_at) == (2, 3, 400.0)
+    (entry,) = store.newest_living(None, None, 10, 250.0).records
+    assert (entry.n_observations, entry.session.n_events, entry.session.expires_at) == (2, 3, 400.0)
 
 
 def test_sessions_that_were_removed_meanwhile_take_no_more(store: SessionStore, tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def batches(store: SessionStore) -> list[int]:
 
 
 def rows(folder: Path) -> list[int]:
-    """As another connection sees them: what is not committed is not there."""
+    """The rows that another connection sees, which are those that are committed."""
     with sqlite3.connect(folder / "sessions.sqlite") as other:
         numbers = [int(name) for (name,) in other.execute("SELECT name FROM snapshot ORDER BY rowid")]
     other.close()
@@ -269,7 +269,7 @@ def test_a_write_may_be_on_the_disk_before_its_sender_goes_on(
         def put(self, write: Any) -> None:
             waiting.put(write)
             if write is not None:
-                wait([done for _, done in write], timeout=60)
+                wait([future for _, future in write], timeout=60)
 
     monkeypatch.setattr(store._commits, "_queue", Preempted())
     store.append(number, observed(1), 101.0).result(60)

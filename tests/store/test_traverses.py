@@ -33,21 +33,21 @@ def summer(campus: Catalog) -> Iterator[Traverse]:
         yield traverse
 
 
-def frame(index: int, encoding: NDArray[np.floating], position_m: float, **known: Any) -> Drive:
+def frame(index: int, encoding: NDArray[np.floating], position_m: float, **fields: Any) -> Drive:
     rows = np.asarray(encoding, np.float32)[np.newaxis]
-    return Drive(index=np.array([index]), position_m=np.array([position_m]), encodings=rows, **known)
+    return Drive(index=np.array([index]), position_m=np.array([position_m]), encodings=rows, **fields)
 
 
 def arrays_of(drive: Drive) -> dict[str, np.ndarray]:
     return {name: array for name, array in vars(drive).items() if isinstance(array, np.ndarray)}
 
 
-def same(left: Drive, right: Drive) -> bool:
-    ours, theirs = arrays_of(left), arrays_of(right)
+def is_equal(left: Drive, right: Drive) -> bool:
+    left_arrays, right_arrays = arrays_of(left), arrays_of(right)
     return left.weights_sha256 == right.weights_sha256 and all(
-        ours[name].dtype.kind == theirs[name].dtype.kind
-        and np.array_equal(ours[name], theirs[name], equal_nan=ours[name].dtype.kind == "f")
-        for name in ours
+        left_arrays[name].dtype.kind == right_arrays[name].dtype.kind
+        and np.array_equal(left_arrays[name], right_arrays[name], equal_nan=left_arrays[name].dtype.kind == "f")
+        for name in left_arrays
     )
 
 
@@ -67,17 +67,17 @@ def test_frames_come_back_exactly_and_in_index_order(
     assert summer.put_frames(frames) == (4, 0)
     order = np.argsort(frames.index)
     expected = Drive(**{name: array[order] for name, array in arrays_of(frames).items()})
-    assert same(summer.read(), expected)
+    assert is_equal(summer.read(), expected)
     assert (summer.n_frames, summer.encoding_dim) == (4, 8)
     assert summer.summary().missing == [(1, 1), (3, 4), (6, 6)]
     summer.close()
     with Traverse.open(campus.data_dir, "campus", "summer") as again:
-        assert same(again.read(), expected)
+        assert is_equal(again.read(), expected)
 
 
 def test_one_frame_is_new_once_and_then_replaced(summer: Traverse) -> None:
-    known = {"timestamp_us": np.array([10]), "x_m": np.array([0.5])}
-    assert summer.put_frames(frame(3, np.arange(4), 1.5, **known)) == (1, 0)
+    fields = {"timestamp_us": np.array([10]), "x_m": np.array([0.5])}
+    assert summer.put_frames(frame(3, np.arange(4), 1.5, **fields)) == (1, 0)
     assert summer.put_frames(frame(3, np.ones(4), 2.5)) == (0, 1)
     frames = summer.read()
     assert frames.n_frames == summer.n_frames == 1
@@ -105,10 +105,10 @@ def test_bad_frames_change_nothing(
     summer: Traverse, make_frames: MakeFrames, change: dict[str, np.ndarray], error: type[DeepSimbadError]
 ) -> None:
     summer.put_frames(make_frames([0, 5]))
-    before = summer.read()
+    old_drive = summer.read()
     with pytest.raises(error):
         summer.put_frames(replace(make_frames([0, 1, 2], seed=1), **change))
-    assert same(summer.read(), before)
+    assert is_equal(summer.read(), old_drive)
 
 
 def test_a_deleted_traverse_takes_no_more_frames(summer: Traverse, campus: Catalog, make_frames: MakeFrames) -> None:
@@ -128,9 +128,9 @@ def test_one_that_is_deleted_while_it_is_opened_is_unknown(
 ) -> None:
     opening = traverses.open_working_file
 
-    def too_late(*given: Any, **more: Any) -> Any:
+    def too_late(*arguments: Any, **options: Any) -> Any:
         Traverse.delete(campus.data_dir, "campus", summer.name)
-        return opening(*given, **more)
+        return opening(*arguments, **options)
 
     monkeypatch.setattr(traverses, "open_working_file", too_late)
     with pytest.raises(UnknownTraverseError):
@@ -155,14 +155,21 @@ def test_a_truncated_or_foreign_file_is_named_and_can_be_deleted(campus: Catalog
     path = campus.data_dir / "domains/campus/traverses/summer.sqlite"
     with Traverse.create(campus.data_dir, "campus", "summer") as traverse:
         traverse.put_frames(make_frames(range(400)))
-    whole = path.read_bytes()
+    traverse_bytes = path.read_bytes()
 
     def read() -> None:
         with Traverse.open(campus.data_dir, "campus", "summer") as traverse:
             traverse.read()
 
     catalog_bytes = (campus.data_dir / "catalog.sqlite").read_bytes()
-    for content in (b"", whole[:100], whole[:4096], whole[: len(whole) // 2], b"no database" * 1000, catalog_bytes):
+    for content in (
+        b"",
+        traverse_bytes[:100],
+        traverse_bytes[:4096],
+        traverse_bytes[: len(traverse_bytes) // 2],
+        b"no database" * 1000,
+        catalog_bytes,
+    ):
         path.write_bytes(content)
         with pytest.raises(DamagedFileError, match="summer"):
             read()
@@ -176,13 +183,13 @@ def test_uploading_and_reading_hold_little_beside_the_one_array(summer: Traverse
     summer.put_frames(frames, replace=False)
     _, put_peak = tracemalloc.get_traced_memory()
     tracemalloc.reset_peak()
-    before, _ = tracemalloc.get_traced_memory()
+    n_bytes_before, _ = tracemalloc.get_traced_memory()
     back = summer.read()
     _, read_peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     n_bytes = frames.encodings.nbytes
     assert put_peak < 0.25 * n_bytes
-    assert n_bytes < read_peak - before < 1.25 * n_bytes
+    assert n_bytes < read_peak - n_bytes_before < 1.25 * n_bytes
     assert np.array_equal(back.encodings, frames.encodings)
 
 
@@ -205,14 +212,14 @@ def test_what_frames_show_is_stored_with_them_and_levels_with_the_frame_that_gav
 
 
 def test_the_camera_of_an_unchanged_traverse_is_read_once(campus: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    where = (campus.data_dir, "campus", "summer")
-    with Traverse.create(*where) as summer:
-        assert Traverse.main_camera(*where) is None
+    location = (campus.data_dir, "campus", "summer")
+    with Traverse.create(*location) as summer:
+        assert Traverse.main_camera(*location) is None
         summer.put_frames(frame(0, np.ones(4), 0.0, camera=Camera(40, 30)))
-        assert Traverse.main_camera(*where) == Camera(40, 30)
-    assert Traverse.main_camera(*where) == Camera(40, 30)  # the file was closed meanwhile
+        assert Traverse.main_camera(*location) == Camera(40, 30)
+    assert Traverse.main_camera(*location) == Camera(40, 30)  # the file was closed meanwhile
     monkeypatch.setattr(Traverse, "open", None)
-    assert Traverse.main_camera(*where) == Camera(40, 30)
+    assert Traverse.main_camera(*location) == Camera(40, 30)
     with pytest.raises(UnknownTraverseError):
         Traverse.main_camera(campus.data_dir, "campus", "winter")
 
@@ -245,18 +252,18 @@ def test_a_disk_that_fills_while_pictures_wait_is_named_and_leaves_all_as_it_was
     summer.put_frames(make_frames([0, 1, 2]), pictures={0: b"waits"})
     (n_pages,) = summer._db.conn.execute("PRAGMA page_count").fetchone()
     summer._db.conn.execute(f"PRAGMA max_page_count = {n_pages}")
-    dim, more = summer.read().encoding_dim, make_frames([3])
+    dim, new_frames = summer.read().encoding_dim, make_frames([3])
     for _ in range(2):
         with pytest.raises(UnavailableError) as full:
-            summer.put_frames(more, pictures={3: bytes(1 << 20)})
+            summer.put_frames(new_frames, pictures={3: bytes(1 << 20)})
         assert full.value.hints["reason"] == "disk_full"
     with pytest.raises(UnavailableError):
         summer.keep_views({0: np.zeros((4096, dim), np.float32)})
-    about = summer.summary()
-    assert (about.n_frames, about.n_spooled, about.spooled_bytes) == (3, 1, 5)
+    summary = summer.summary()
+    assert (summary.n_frames, summary.n_spooled, summary.spooled_bytes) == (3, 1, 5)
     assert (summer.picture(0), summer.views(0, dim)) == (b"waits", None)
     summer._db.conn.execute("PRAGMA max_page_count = 1000000")
-    assert summer.put_frames(more, pictures={3: bytes(1 << 20)}) == (1, 0)
+    assert summer.put_frames(new_frames, pictures={3: bytes(1 << 20)}) == (1, 0)
 
 
 def test_frames_unlike_all_others_are_counted_beside_those_whose_pictures_show_nothing(

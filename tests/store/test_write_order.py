@@ -33,7 +33,7 @@ class Tape:
         return os.path.relpath(text, self._folder)
 
     def since(self, act: Callable[[], Any], *only: str) -> list[str]:
-        """The lines that an act adds, of these beginnings (all: none given)."""
+        """The lines that an act adds, of them those that begin so (none given: all)."""
         n_before = len(self.lines)
         act()
         return [line for line in self.lines[n_before:] if not only or line.split()[0] in only]
@@ -46,9 +46,9 @@ def tape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tape:
     def recorded(call: str) -> Callable[..., Any]:
         real = getattr(os, call)
 
-        def record(*arguments: Any, **more: Any) -> Any:
+        def record(*arguments: Any, **options: Any) -> Any:
             paths = arguments[: 2 if call in {"rename", "replace", "link"} else 1]
-            answer = real(*arguments, **more)
+            answer = real(*arguments, **options)
             tape.lines.append(" ".join([call, *(tape.name(path) for path in paths)]))
             return answer
 
@@ -58,8 +58,8 @@ def tape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tape:
         monkeypatch.setattr(os, call, recorded(call))
     connect = sqlite3.connect
 
-    def traced(path: str, **more: Any) -> sqlite3.Connection:
-        opened = connect(path, **more)
+    def traced(path: str, **options: Any) -> sqlite3.Connection:
+        traced_connection = connect(path, **options)
         name = tape.name(path.removeprefix("file://").partition("?")[0])
 
         def record(statement: str) -> None:
@@ -67,8 +67,8 @@ def tape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tape:
             if words[0] in {"COMMIT", "VACUUM"}:
                 tape.lines.append(f"{words[0]} {name}")
 
-        opened.set_trace_callback(record)
-        return opened
+        traced_connection.set_trace_callback(record)
+        return traced_connection
 
     monkeypatch.setattr(connection.sqlite3, "connect", traced)
     return tape
@@ -128,27 +128,27 @@ def test_an_acknowledged_observation(tape: Tape, tmp_path: Path) -> None:
         row = ObservedRow(1, 9.0, 1.0, None, np.array([1, 2], np.float32))
 
         def acknowledged() -> None:
-            done = store.append(session.number, row, 2.0)
-            done.add_done_callback(lambda _: tape.lines.append("acknowledged"))
-            done.result()
+            future = store.append(session.number, row, 2.0)
+            future.add_done_callback(lambda _: tape.lines.append("acknowledged"))
+            future.result()
 
         assert tape.since(acknowledged) == ["COMMIT sessions.sqlite", "acknowledged"]
 
 
 def test_new_files_and_folders(tape: Tape, tmp_path: Path) -> None:
-    def opened() -> None:
+    def open_catalog() -> None:
         Catalog.open(tmp_path).close()
 
-    assert tape.since(opened, "fsync") == ["fsync ."]
+    assert tape.since(open_catalog, "fsync") == ["fsync ."]
     assert tape.since(lambda: SessionStore.open(tmp_path).close(), "fsync") == ["fsync ."]
     with Catalog.open(tmp_path) as catalog:
         lines = tape.since(lambda: catalog.create_domain("campus", {}, False, [1]), "fsync", "COMMIT")
         assert lines == ["fsync domains/campus", "fsync domains", "fsync .", "COMMIT catalog.sqlite"]
         folder = "domains/campus/traverses"
-        made: list[Traverse] = []
-        lines = tape.since(lambda: made.append(Traverse.create(tmp_path, "campus", "a")), "fsync", "rename")
+        traverses: list[Traverse] = []
+        lines = tape.since(lambda: traverses.append(Traverse.create(tmp_path, "campus", "a")), "fsync", "rename")
         assert lines == [f"fsync {folder}/a.new", f"rename {folder}/a.new {folder}/a.sqlite", f"fsync {folder}"]
-        with made[0] as traverse:
+        with traverses[0] as traverse:
             assert committed_for_good(traverse._db.conn)
         lines = tape.since(lambda: Traverse.delete(tmp_path, "campus", "a"), "fsync", "unlink")
         assert lines[-1] == f"fsync {folder}"
@@ -164,7 +164,7 @@ def test_new_files_and_folders(tape: Tape, tmp_path: Path) -> None:
 
 
 def test_what_is_carried_elsewhere(tape: Tape, tmp_path: Path, make_map: MakeMap) -> None:
-    data_dir, backup, exported, there = (tmp_path / name for name in ("data", "b.tar", "a.map", "there"))
+    data_dir, backup, exported, restored = (tmp_path / name for name in ("data", "b.tar", "a.map", "there"))
     with Catalog.open(data_dir) as catalog:
         catalog.create_domain("campus", {}, False, [1, 2, 3])
         sealed(catalog, make_map)
@@ -175,7 +175,7 @@ def test_what_is_carried_elsewhere(tape: Tape, tmp_path: Path, make_map: MakeMap
             lines = tape.since(act, "fsync", "link")
             part = lines[0].split()[1]
             assert lines == [f"fsync {part}", f"link {part} {file}", "fsync ."]
-    lines = tape.since(lambda: restore(backup, there, lambda _: None), "fsync", "rename")
+    lines = tape.since(lambda: restore(backup, restored, lambda _: None), "fsync", "rename")
     last_rename = max(n for n, line in enumerate(lines) if line.startswith("rename"))
     synced = {Path(line.split()[1]).name for line in lines[:last_rename] if line.startswith("fsync")}
     assert {"catalog.sqlite", "000001.sqlite", "maps", "campus", "domains"} <= synced
