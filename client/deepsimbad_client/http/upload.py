@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.frames import IDENTITY, UNKNOWN_CONTENT, content_digest, differences
 from deepsimbad_client.errors import BrokenFrameError, InvalidInputError, OtherFramesError, SourceError
 from deepsimbad_client.http.client import Client
-from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, shown, spread
+from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, first_names, spread
 from deepsimbad_client.recordings.annotations import as_taken
 
 BATCH_BYTES = 8 * 2**20  # Size of a batch of ready encodings: worth its round trip, and lost cheaply on a thin link
@@ -182,7 +182,7 @@ class Comparison:
             return set(rows)
         raise OtherFramesError(
             f"traverse {traverse} holds other frames than {self._recording.name}: {len(rows)} of the {len(self.rows)} "
-            f"that both have differ in {', '.join(masks)} ({shown(names)}), and nothing was sent: "
+            f"that both have differ in {', '.join(masks)} ({first_names(names)}), and nothing was sent: "
             + (
                 f"{self._n_unsent} frames there are not of this recording, so {_advice(traverse)}"
                 if replace

@@ -1,4 +1,4 @@
-"""Recordings as they lie on disk: what every reader gives and leaves out, and how images are made ready to post."""
+"""Recordings as they lie on disk: what every reader returns and leaves out, and how images are made ready to post."""
 
 import dataclasses
 import math
@@ -33,21 +33,21 @@ TURNS = {0: None, 90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROT
 OTHER_SUFFIXES = frozenset(
     {".gif", ".jp2", ".j2k", ".avif", ".jxl", ".exr", ".hdr", ".tga", ".pbm", ".raw", ".dng", ".cr2", ".nef", ".arw"}
 )
-"""Of images that are not read."""
+"""The suffixes of images that are not read."""
 
 MOST_LEFT_OUT = 0.05  # of a recording's frames; more are accepted only where the caller says so
 NO_IMAGE = " without an image"  # of lines "in positions.csv", beside images "not in positions.csv"
 
-_N_PROBES, _N_SURE = 16, 3  # images that tell what all are; so many of 8 bits, and the others are too
+_N_PROBES, _N_SURE = 16, 3  # images that stand for all; if the first so many have 8 bits, all are taken to
 _MAX_PIXELS = 1 << 30  # the picture is the caller's own
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One moment of a recording; None: not known."""
+    """One moment of a recording; None where unknown."""
 
     index: int  # place in the whole recording, from 0; kept when the recording is sliced
-    name: str  # path-like, as read: the file's name, or the row's for ready encodings
+    name: str  # as read, path-like: the file's name, or the row's for ready encodings
     position_m: float  # along the route
     timestamp_us: int | None = None  # Unix microseconds
     x_m: float | None = None  # first ground coordinate (NCLT: north)
@@ -56,7 +56,7 @@ class Frame:
 
 
 def columns_of(frames: Sequence[Frame]) -> dict[str, Any]:
-    """What frames are known by, arrays [n] as a traverse has them: an unknown time is -1, an unknown coordinate NaN."""
+    """The frames' columns, arrays [n] as a traverse has them: an unknown time is -1, an unknown coordinate NaN."""
     times_us = [UNKNOWN_TIMESTAMP if frame.timestamp_us is None else frame.timestamp_us for frame in frames]
     return {
         "index": np.array([frame.index for frame in frames], np.int64),
@@ -69,7 +69,7 @@ def columns_of(frames: Sequence[Frame]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class EncodedImage:
-    """An image ready to be posted: the bytes of the file and what they are."""
+    """An image ready to be posted, with its media type."""
 
     body: bytes
     content_type: str
@@ -79,25 +79,25 @@ class EncodedImage:
 class Recording:
     """Frames in travel order, with either ready encodings or, in the readers' own classes, images."""
 
-    name: str  # a short one for people: the date, the folder or the file
+    name: str  # short, for people: the date, the folder or the file
     frames: Sequence[Frame]  # those that can be used
     left_out_names: Mapping[str, Sequence[str]] = field(default_factory=dict)  # reason -> frames not in `frames`
     encodings: NDArray[np.float32] | None = None  # [n, d], row i of frame i; None where the frames are images
-    remarks: Sequence[str] = ()  # what the reader took the recording for, where that is not plain
+    remarks: Sequence[str] = ()  # on how the reader understood the recording, where that is not plain
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
-    n_before_slice: int | None = None  # how many frames there were before some were taken; None: all are
-    camera: str | None = None  # what took the images, by its name
+    n_before_slice: int | None = None  # number of frames before some were chosen; None: these are all
+    camera: str | None = None  # name of the camera that took the images
     full_recording: "Recording | None" = None  # of whose frames these are a slice; None: these are all
     tolerance_m: float | None = None  # within which papers on this set count a match as true; None: no known set
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Reason -> how many frames are not in `frames`."""
+        """The number of frames left out, by reason."""
         return counts_of(self.left_out_names)
 
     @property
     def n_whole(self) -> int:
-        """Frames that could be used before any slice, or every few of them, was taken."""
+        """The number of usable frames before any slice or thinning."""
         return len(self.frames) if self.n_before_slice is None else self.n_before_slice
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:  # noqa: ARG002
@@ -117,11 +117,11 @@ class Recording:
         return dataclasses.replace(self, grey_levels=levels, full_recording=full_recording)
 
     def stamp(self, frame: Frame) -> str:
-        """What changes when a frame's image does: its name, and of a file its size and time."""
+        """A text that changes when a frame's image does: its name, and of a file its size and time."""
         return frame.name
 
     def view(self, row: int, input_size: tuple[int, int] | None) -> dict[str, Any]:
-        """What is seen from `frames[row]`, as arguments of a client's calls; raises as `image` does."""
+        """The view of `frames[row]` as arguments of a client's calls; raises as `image` does."""
         if self.encodings is not None:
             return {"encoding": self.encodings[row]}
         image = self.image(self.frames[row], input_size)
@@ -150,12 +150,12 @@ AnyRecording = TypeVar("AnyRecording", bound=Recording)
 
 
 def counts_of(names: Mapping[str, Sequence[str]]) -> dict[str, int]:
-    """Reason -> how many frames are left out for it."""
+    """The number of names for each reason."""
     return {reason: len(frames) for reason, frames in names.items()}
 
 
 def finite_number(text: str) -> float | None:
-    """The number that a cell of a table holds; None: no finite one."""
+    """The number in a cell of a table; None if it is no finite number."""
     try:
         value = float(text)
     except ValueError:
@@ -164,12 +164,12 @@ def finite_number(text: str) -> float | None:
 
 
 def stamp_of(path: Path) -> str:
-    """Name, size and time of a file; of one that is not there its name."""
+    """A file's name, size and time; its name alone where it does not exist."""
     try:
-        there = path.stat()
+        status = path.stat()
     except OSError:
         return path.name
-    return f"{path.name} {there.st_size} {there.st_mtime_ns}"
+    return f"{path.name} {status.st_size} {status.st_mtime_ns}"
 
 
 def read_file(path: Path) -> bytes:
@@ -186,14 +186,14 @@ def read_file(path: Path) -> bytes:
 def decode(body: bytes, path: Path, *, as_stored: bool = False, levels: GreyLevels | None = None) -> Image:
     """Decode an image to 8-bit BGR as the service does (`deepsimbad.evaluators.image`).
 
-    What the service does not take (BMP, PGM, PPM) is decoded too. `as_stored` leaves pixels as they lie in the file,
-    `levels` show more than 8 bits. Raises BrokenFrameError (not an image, damaged, or its end is missing).
+    Formats that the service does not take (BMP, PGM, PPM) are decoded too. `as_stored` leaves pixels as they lie in the
+    file, `levels` show more than 8 bits. Raises BrokenFrameError (not an image, damaged, or its end is missing).
     """
     return in_eight_bits(decode_deep(body, path, as_stored=as_stored), levels)[0]
 
 
 def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[Any]:
-    """As `decode`, of 9 to 16 bits all, as uint16."""
+    """Decode an image as `decode` does, but one of 9 to 16 bits as uint16 with all of them."""
     try:
         if media_type_of(body) is not None:
             return decode_file(ImageFile.read(body, _MAX_PIXELS), as_stored=as_stored)
@@ -212,7 +212,7 @@ def decode_deep(body: bytes, path: Path, *, as_stored: bool = True) -> NDArray[A
 
 
 def require_heic() -> None:
-    """Raises MissingExtraError where the library is not installed; where it is, Pillow opens such files from now on."""
+    """Make Pillow open HEIC files from now on; raises MissingExtraError where the library is not installed."""
     try:
         from pillow_heif import register_heif_opener  # noqa: PLC0415 - an extra
     except ImportError as error:
@@ -223,14 +223,14 @@ def require_heic() -> None:
 
 
 def spread(n: int) -> list[int]:
-    """A few places among n, from the first to the last."""
-    return [round(at) for at in np.linspace(0, max(0, n - 1), min(n, _N_PROBES)).tolist()]
+    """A few of the indices 0..n-1, evenly from the first to the last."""
+    return [round(place) for place in np.linspace(0, max(0, n - 1), min(n, _N_PROBES)).tolist()]
 
 
 def with_grey_levels(recording: AnyRecording, image: Callable[[int], NDArray[Any]]) -> AnyRecording:
-    """The recording, shown by the grey levels that suit its images, where these have more than 8 bits; which is said.
+    """The recording with the grey levels that suit its images, and a remark, where these have more than 8 bits.
 
-    They are measured on a few spread over it; `image` gives one by its place, as `decode_deep` does.
+    They are measured on a few images spread over it; `image` returns one by its row, as `decode_deep` does.
     """
     pictures: list[NDArray[np.uint16]] = []
     for number, place in enumerate(spread(len(recording.frames))):
@@ -257,18 +257,18 @@ def turned(image: Image, degrees: int) -> Image:
 def ready(
     body: bytes, path: Path, input_size: tuple[int, int] | None, rotate: int, levels: GreyLevels | None = None
 ) -> EncodedImage:
-    """An image file's body made ready to post: as it is, or the image at the size asked for where that is smaller.
+    """An image file's body made ready to post: as it is, or as the image at `input_size` where that takes fewer bytes.
 
-    One that is to be turned or shown by levels, or of a format that cannot be posted, goes as PNG. Raises
+    An image that is to be turned or shown by levels, or of a format that cannot be posted, becomes a PNG. Raises
     BrokenFrameError.
     """
     image, media_type = decode(body, path, levels=levels), media_type_of(body)
     if media_type is None or rotate or levels is not None:
         return as_png(turned(image, rotate), input_size)
-    whole = EncodedImage(body, media_type)
+    original = EncodedImage(body, media_type)
     if not is_larger(image, input_size):
-        return whole
-    return min(as_png(image, input_size), whole, key=lambda encoded: len(encoded.body))
+        return original
+    return min(as_png(image, input_size), original, key=lambda encoded: len(encoded.body))
 
 
 def is_larger(image: Image, input_size: tuple[int, int] | None) -> bool:
@@ -277,19 +277,19 @@ def is_larger(image: Image, input_size: tuple[int, int] | None) -> bool:
 
 
 def as_png(image: Image, input_size: tuple[int, int] | None) -> EncodedImage:
-    """Make an image ready to post without loss: the service sees what it would make of the whole picture itself.
+    """Make an image ready to post as PNG, from which the service gets the same pixels as from the whole picture.
 
-    One that is larger is brought to exactly `input_size` by the rule that the service's evaluators resize by.
+    A larger image is resized to exactly `input_size` by the rule of the service's evaluators.
     """
     height, width = image.shape[:2]
     if input_size is not None and is_larger(image, input_size):
         image = resized(image, input_size)
     body = cv2.imencode(".png", image)[1].tobytes()
-    return EncodedImage(body if image.shape[:2] == (height, width) else _shown_as(width, height, body), "image/png")
+    return EncodedImage(body if image.shape[:2] == (height, width) else _with_shape(width, height, body), "image/png")
 
 
-def _shown_as(width: int, height: int, png: bytes) -> bytes:
-    """A PNG that says by the shape of its pixels which picture it is a copy of (its chunk pHYs, of no unit)."""
+def _with_shape(width: int, height: int, png: bytes) -> bytes:
+    """The PNG with the shape of its pixels (chunk pHYs, of no unit) such that it shows a width x height picture."""
     own_width, own_height = struct.unpack_from(">II", png, 16)
     shape = Fraction(own_width * height, own_height * width)
     chunk = b"pHYs" + struct.pack(">IIB", shape.numerator, shape.denominator, 0)
@@ -297,10 +297,10 @@ def _shown_as(width: int, height: int, png: bytes) -> bytes:
 
 
 class LeftOut:
-    """Frames that are not used, reason -> their names: those a reader left out and those broken when they are read."""
+    """The frames that are not used: by reason the `names` of those a reader left out and of those that broke later."""
 
     def __init__(self, recording: Recording, *, allow_missing: bool) -> None:
-        """What the reader left out; raises as `add`."""
+        """Begin with the frames that the reader left out; raises as `add`."""
         self.names = {reason: list(names) for reason, names in recording.left_out_names.items()}
         self._recording, self._allow_missing = recording, allow_missing
         n_by_reader = sum(map(len, self.names.values())) - _n_misspelt(self.names)
@@ -308,7 +308,7 @@ class LeftOut:
         self._check()
 
     def add(self, reason: str, name: str) -> None:
-        """One more frame is broken. Raises TooManyLeftOutError (more than a twentieth of the recording is left out)."""
+        """Count one more broken frame; raises TooManyLeftOutError (more than a twentieth is left out)."""
         self.names.setdefault(reason, []).append(name)
         self._share += 1 / len(self._recording.frames)
         self._check()
@@ -316,7 +316,7 @@ class LeftOut:
     def _check(self) -> None:
         if self._allow_missing or self._share <= MOST_LEFT_OUT + 1e-9:
             return
-        reasons = "; ".join(f"{len(names)} {reason} ({shown(names)})" for reason, names in self.names.items())
+        reasons = "; ".join(f"{len(names)} {reason} ({first_names(names)})" for reason, names in self.names.items())
         raise TooManyLeftOutError(
             f"{self._share:.0%} of the frames of {self._recording.name} are left out: {reasons}; more than "
             f"{MOST_LEFT_OUT:.0%} need --allow-missing"
@@ -324,7 +324,7 @@ class LeftOut:
 
 
 def _n_misspelt(names: Mapping[str, Sequence[str]]) -> int:
-    """How many images that a table does not name may be those of its lines that name no image."""
+    """How many images missing from a table may be meant by its lines that name no image."""
     return sum(
         min(len(lines), len(names.get(f"not {reason.removesuffix(NO_IMAGE)}", ())))
         for reason, lines in names.items()
@@ -333,13 +333,13 @@ def _n_misspelt(names: Mapping[str, Sequence[str]]) -> int:
 
 
 def left_out_lines(names: Mapping[str, Sequence[str]], *, verbose: bool) -> list[str]:
-    """What is left out of a recording, reason -> names: a line a reason, with every name or the first of them."""
+    """A line for each reason why frames are left out, with all of their names or the first of them."""
     return [
-        f"left out: {len(frames)} {reason} ({shown(frames, len(frames) if verbose else 3)})"
+        f"left out: {len(frames)} {reason} ({first_names(frames, len(frames) if verbose else 3)})"
         for reason, frames in names.items()
     ]
 
 
-def shown(names: Sequence[str], n_shown: int = 3) -> str:
-    """The first of some names."""
+def first_names(names: Sequence[str], n_shown: int = 3) -> str:
+    """The first names in words, with "..." for more."""
     return ", ".join(names[:n_shown]) + (", ..." if len(names) > n_shown else "")

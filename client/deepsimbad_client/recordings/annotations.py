@@ -1,4 +1,4 @@
-"""What is told beside a recording's images: `detections.jsonl`, objects a picture, and `captions.csv`, words a picture.
+"""Annotations of a recording's images: the objects of each in `detections.jsonl`, its words in `captions.csv`.
 
 They lie with the images or, in NCLT's layout, in the drive's folder. A line of detections is `{"name": "1.jpg",
 "objects": [{"label": "car", "box": [left, top, right, bottom], "score": 0.9}]}`; captions have the columns name and
@@ -20,53 +20,53 @@ from deepsimbad_client.recordings import EncodedImage, Frame, Recording
 
 DETECTIONS, CAPTIONS = "detections.jsonl", "captions.csv"
 ANNOTATION_SUFFIXES = {".txt": "text/plain", ".json": "application/json"}
-"""Of files that tell of one view, and how they are posted."""
+"""The suffixes of files that annotate one view, and the media types they are posted as."""
 FORMS = {"objects": DETECTIONS, "text": CAPTIONS}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnnotatedRecording(Recording):
-    """A recording whose frames are seen by what is told of them, beside their images or in their place."""
+    """A recording whose views are annotations, with their images or in their place."""
 
     pictured: Recording
-    told: Mapping[str, Mapping[str, Any]]  # by form, by the frame's name
+    annotations: Mapping[str, Mapping[str, Any]]  # by form, by the frame's name
     with_image: bool
 
     def stamp(self, frame: Frame) -> str:
         """See `Recording.stamp`."""
-        said = json.dumps([by_name.get(frame.name) for by_name in self.told.values()])
-        return f"{self.pictured.stamp(frame) if self.with_image else frame.name} {said}"
+        text = json.dumps([by_name.get(frame.name) for by_name in self.annotations.values()])
+        return f"{self.pictured.stamp(frame) if self.with_image else frame.name} {text}"
 
     def shown_by(self, levels: GreyLevels | None) -> "AnnotatedRecording":
         """See `Recording.shown_by`."""
         return dataclasses.replace(self, pictured=self.pictured.shown_by(levels))
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
-        """The body of what is seen and told; raises BrokenFrameError also where nothing is told of the frame."""
-        for form, by_name in self.told.items():
+        """The body of a frame's annotations, with its image where `with_image`; raises BrokenFrameError."""
+        for form, by_name in self.annotations.items():
             if frame.name not in by_name:
                 raise BrokenFrameError(f"{FORMS[form]} says nothing of {frame.name}", f"not in {FORMS[form]}")
         picture = self.pictured.image(frame, input_size).body if self.with_image else None
-        body = scene_observation({form: by_name[frame.name] for form, by_name in self.told.items()}, picture)
+        body = scene_observation({form: by_name[frame.name] for form, by_name in self.annotations.items()}, picture)
         return EncodedImage(body.body, body.content_type)
 
 
 def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
     """The recording in the forms that a domain takes, as `Domain.takes` names them; ready encodings as they are.
 
-    Raises SourceError: what should be told of its images is not there, or cannot be understood.
+    Raises SourceError (the annotations of its images are missing, or cannot be understood).
     """
     forms = [form for form in FORMS if form in takes]
     if recording.encodings is not None or not forms or isinstance(recording, AnnotatedRecording):
         return recording
-    folder, told = getattr(recording, "folder", None), dict[str, Mapping[str, Any]]()
+    folder, annotations = getattr(recording, "folder", None), dict[str, Mapping[str, Any]]()
     for form in forms:
         file = None if folder is None else _file(folder, FORMS[form])
         if file is not None:
-            told[form] = _read(file, form)
-    if not told and "image" in takes:
+            annotations[form] = _read(file, form)
+    if not annotations and "image" in takes:
         return recording
-    if not told:
+    if not annotations:
         raise SourceError(
             f"{recording.name} has no {' nor '.join(FORMS[form] for form in forms)} beside its images, and the domain "
             f"takes {' and '.join(sorted(takes))}"
@@ -74,7 +74,7 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
     return AnnotatedRecording(
         **{field.name: getattr(recording, field.name) for field in dataclasses.fields(Recording)},
         pictured=recording,
-        told=told,
+        annotations=annotations,
         with_image="image" in takes,
     )
 
@@ -85,12 +85,12 @@ def _file(folder: Path, name: str) -> Path | None:
 
 
 def _read(file: Path, form: str) -> dict[str, Any]:
-    told: dict[str, Any] = {}
-    for name, what in _rows(file, form):
-        if name in told:
+    annotations: dict[str, Any] = {}
+    for name, annotation in _rows(file, form):
+        if name in annotations:
             raise SourceError(f"{file} tells of {name} twice")
-        told[name] = what
-    return told
+        annotations[name] = annotation
+    return annotations
 
 
 def _rows(file: Path, form: str) -> Iterator[tuple[str, Any]]:
@@ -102,8 +102,8 @@ def _rows(file: Path, form: str) -> Iterator[tuple[str, Any]]:
                     raise SourceError(f"{file}: its first line names the columns name and text")
                 for row in table:
                     if None in row:
-                        more = "more cells than the first: put a text with commas between quotes"
-                        raise SourceError(f"{file}, line {table.line_num}: {more}")
+                        trouble = "more cells than the first: put a text with commas between quotes"
+                        raise SourceError(f"{file}, line {table.line_num}: {trouble}")
                     yield row["name"], row["text"] or ""
                 return
             for number, line in enumerate(lines, 1):

@@ -2,8 +2,8 @@
 
     rosbag:FILE.bag, rosbag:FOLDER, FILE.mcap, FILE.db3     and behind each #IMAGE_TOPIC or #IMAGE_TOPIC,POSITION_TOPIC
 
-Images are `sensor_msgs/Image` or `CompressedImage`. Positions are the first there is of `geometry_msgs/PoseStamped` and
-`PoseWithCovarianceStamped`, `sensor_msgs/NavSatFix`, and `nav_msgs/Odometry`, whose x, y begin anew with every drive
+Images are `sensor_msgs/Image` or `CompressedImage`. Positions are the first available of `geometry_msgs/PoseStamped`,
+`PoseWithCovarianceStamped`, `sensor_msgs/NavSatFix` and `nav_msgs/Odometry`, whose x, y begin anew with every drive
 and are not kept. Times are those of the headers, or of the recording where headers have none.
 """
 
@@ -37,7 +37,7 @@ from deepsimbad_client.recordings import (
 )
 from deepsimbad_client.recordings.folder import shape_in, shape_remarks
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
-from deepsimbad_client.recordings.placing import Placed, placed_on
+from deepsimbad_client.recordings.placing import Placement, place_on_track
 from deepsimbad_client.recordings.track import DEADBAND_M, Track, track_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 BAG_PREFIX = "rosbag:"
 BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
-MOST_LATE_US = 1_000_000  # an image may be recorded before another one of a time so much earlier
+MOST_LATE_US = 1_000_000  # by which the time of an image may step back in the order of recording
 _MENDED_BY = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover` mends what was cut off"
 METADATA = "metadata.yaml"  # in the folder that is a ROS 2 bag
 
@@ -53,8 +53,8 @@ _COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _IMAGES = ("sensor_msgs/msg/Image", _COMPRESSED)
 _POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _FIX, _ODOMETRY = "sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry"
-_POSITIONS = (*_POSES, _FIX, _ODOMETRY)  # by which drives can be compared best first
-_LAYOUTS: dict[str, tuple[type, int, int | None]] = {  # sample type, channels, how to BGR
+_POSITIONS = (*_POSES, _FIX, _ODOMETRY)  # first those by which drives can be compared best
+_LAYOUTS: dict[str, tuple[type, int, int | None]] = {  # sample type, channels, OpenCV's conversion to BGR
     "mono8": (np.uint8, 1, None),
     "8UC1": (np.uint8, 1, None),
     "bgr8": (np.uint8, 3, None),
@@ -81,16 +81,16 @@ _Rows = list[tuple[int, float, float, float]]  # microseconds, two coordinates, 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BagRecording(Recording):
-    """Images of one topic."""
+    """The images of one topic."""
 
     path: Path
     topic: str
-    received_ns: Mapping[str, int]  # by frame name: when the recorder wrote it down, by which it is read again
+    received_ns: Mapping[str, int]  # by frame name: when the recorder received it, by which it is read again
     rotate: int = 0  # degrees clockwise by which images are turned
-    turn: threading.Lock = field(default_factory=threading.Lock, repr=False)  # the reader serves one thread
+    reader_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)  # the reader serves one thread
 
     def stamp(self, frame: Frame) -> str:
-        """Of its file and time; see `Recording.stamp`."""
+        """The stamp of the bag and the frame's name; see `Recording.stamp`."""
         return f"{stamp_of(self.path)} {frame.name}"
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
@@ -104,28 +104,28 @@ class BagRecording(Recording):
         return as_png(turned(image, self.rotate), input_size)
 
     def deep(self, row: int) -> NDArray[Any]:
-        """A frame's pixels, of 9 to 16 bits all."""
+        """A frame's pixels in BGR, uint8, or uint16 with all of 9 to 16 bits; raises BrokenFrameError."""
         kind, message = self._read(self.frames[row])
         name = self.frames[row].name
         return decode_deep(bytes(message.data), Path(name)) if kind == _COMPRESSED else _pixels(message, name)
 
     def _read(self, frame: Frame) -> tuple[str, Any]:
         """A frame's message and its type. Raises BrokenFrameError."""
-        at = self.received_ns[frame.name]
-        with self.turn:
+        received_ns = self.received_ns[frame.name]
+        with self.reader_lock:
             try:
-                found = next(_messages(self._reader, {self.topic}, start=at, stop=at + 1), None)
+                entry = next(_messages(self._reader, {self.topic}, start=received_ns, stop=received_ns + 1), None)
             except SourceError as error:
                 raise BrokenFrameError(f"{frame.name}: {error}", "undecodable") from error
-            if found is None:
+            if entry is None:
                 raise BrokenFrameError(f"{frame.name} is not in {self.path} any more", "unreadable file")
-            _, kind, _, raw = found
+            _, kind, _, raw = entry
             return kind, _message(self._reader, raw, kind, frame.name)
 
     @cached_property
     def _reader(self) -> "AnyReader":
-        """Opened when the first image is asked for, closed with the recording."""
-        reader = _opened(self.path)
+        """The bag's reader, opened with the first image, closed with the recording."""
+        reader = _bag_reader(self.path)
         reader.open()
         weakref.finalize(self, reader.close)
         return reader
@@ -139,57 +139,59 @@ def read_bag(
     time_offset_us: int = 0,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> BagRecording:
-    """Open a bag; `topics` is IMAGE, or IMAGE,POSITION, or "": what there is.
+    """Open a bag; `topics` is IMAGE, or IMAGE,POSITION, or "" for those it has.
 
-    All messages of both topics are gone through once, for the times in their headers. Raises SourceError (the library
-    cannot read it, or which topic is meant cannot be told), MissingExtraError.
+    All messages of both topics are read once, for the times in their headers. Raises SourceError (the library cannot
+    read it, or it has several topics to choose from), MissingExtraError.
     """
     image_topic, _, position_topic = topics.partition(",")
     remarks: list[str] = []
-    with _opened(path) as reader:
+    with _bag_reader(path) as reader:
         types = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
-        image_topic = _chosen(image_topic, [name for name, kind in types.items() if kind in _IMAGES], "images", path)
+        image_topic = _choose_topic(
+            image_topic, [name for name, kind in types.items() if kind in _IMAGES], "images", path
+        )
         placing = sorted(
             (name for name in types if types[name] in _POSITIONS), key=lambda name: _POSITIONS.index(types[name])
         )
         if position_topic or placing:
-            position_topic = _chosen(position_topic, placing, "positions", path, take_first=True)
-            others = f" (there are {', '.join(placing)})" if len(placing) > 1 else ""
-            remarks.append(f"images of {image_topic}, positions of {position_topic}{others}")
+            position_topic = _choose_topic(position_topic, placing, "positions", path, take_first=True)
+            choice = f" (there are {', '.join(placing)})" if len(placing) > 1 else ""
+            remarks.append(f"images of {image_topic}, positions of {position_topic}{choice}")
         else:
             remarks.append(f"images of {image_topic}, {spacing_m:g} m apart: there are no poses, fixes or odometry")
-        heard = _Heard(image_topic, position_topic, time_offset_us)
+        content = _Content(image_topic, position_topic, time_offset_us)
         span = max(1, reader.end_time - reader.start_time)
-        for topic, kind, received, raw in _messages(reader, {image_topic, position_topic}):
-            on_progress((received - reader.start_time) / span)
-            heard.take(reader, topic, kind, received, raw, f"{path.name}{topic}/{received}")
-    if not heard.images:
+        for topic, kind, received_ns, raw in _messages(reader, {image_topic, position_topic}):
+            on_progress((received_ns - reader.start_time) / span)
+            content.take(reader, topic, kind, received_ns, raw, f"{path.name}{topic}/{received_ns}")
+    if not content.images:
         raise SourceError(f"{path}: {image_topic} holds no image that can be read")
-    remarks += heard.of_one_clock()
-    images = sorted(heard.images, key=lambda image: image[1])
+    remarks += content.check_clock()
+    images = sorted(content.images, key=lambda image: image[1])
     if position_topic:
-        result = _placed(images, heard.rows, types[position_topic], f"{path}, {position_topic}")
+        placement = _place_images(images, content.rows, types[position_topic], f"{path}, {position_topic}")
     else:
-        result = Placed([Frame(i, name, i * spacing_m, time_us) for i, (name, time_us) in enumerate(images)])
-    result.left_out_names |= heard.lost
-    if heard.n_lost_positions:
-        remarks.append(f"{heard.n_lost_positions} messages of {position_topic} cannot be read and are not used")
+        placement = Placement([Frame(i, name, i * spacing_m, time_us) for i, (name, time_us) in enumerate(images)])
+    placement.left_out_names |= content.lost_images
+    if content.n_lost_positions:
+        remarks.append(f"{content.n_lost_positions} messages of {position_topic} cannot be read and are not used")
     recording = BagRecording(
         path.stem,
-        tuple(result.frames),
-        result.left_out_names,
-        remarks=[*remarks, *result.remarks, *shape_remarks(heard.shapes)],
+        tuple(placement.frames),
+        placement.left_out_names,
+        remarks=[*remarks, *placement.remarks, *shape_remarks(content.shapes)],
         path=path,
         topic=image_topic,
-        received_ns=heard.received_ns,
+        received_ns=content.received_ns,
         rotate=rotate,
     )
     return with_grey_levels(recording, recording.deep)
 
 
 @dataclass
-class _Heard:
-    """What the messages of both topics say."""
+class _Content:
+    """The content of the messages of both topics."""
 
     image_topic: str
     position_topic: str
@@ -197,57 +199,57 @@ class _Heard:
     received_ns: dict[str, int] = field(default_factory=dict)
     images: list[tuple[str, int]] = field(default_factory=list)
     rows: _Rows = field(default_factory=list)
-    lost: dict[str, list[str]] = field(default_factory=dict)  # images, by reason
-    shapes: list[tuple[str, str | None]] = field(default_factory=list)  # of each image
+    lost_images: dict[str, list[str]] = field(default_factory=dict)  # names by reason
+    shapes: list[tuple[str, str | None]] = field(default_factory=list)  # (name, shape) of each image
     n_lost_positions: int = 0
 
-    def of_one_clock(self) -> list[str]:
-        """What is to be said of the headers' times; where all are one, images get those of the recording."""
+    def check_clock(self) -> list[str]:
+        """Remarks on the headers' times; where all are equal, images get the times of the recording."""
         times = [time_us for _, time_us in self.images]
         if len(times) > 2 and len(set(times)) == 1:
-            received = ((name, self.received_ns[name] // 1000 + self.time_offset_us) for name, _ in self.images)
-            self.images = sorted(received, key=lambda image: image[1])
+            images = ((name, self.received_ns[name] // 1000 + self.time_offset_us) for name, _ in self.images)
+            self.images = sorted(images, key=lambda image: image[1])
             return ["all headers say one time: images have the times at which they were recorded"]
         steps_us = np.diff(times, prepend=times[0])
-        at = int(np.argmin(steps_us))
-        if steps_us[at] > -MOST_LATE_US:
+        row = int(np.argmin(steps_us))
+        if steps_us[row] > -MOST_LATE_US:
             return []
-        back = f"{self.images[at][0]} says {-steps_us[at] / 1e6:.1f} s before the image recorded before it"
+        back = f"{self.images[row][0]} says {-steps_us[row] / 1e6:.1f} s before the image recorded before it"
         return [f"{back}: images are taken in the order of their headers' times. Was a clock set on the way?"]
 
-    def take(self, reader: "AnyReader", topic: str, kind: str, received: int, raw: bytes, name: str) -> None:
-        """One more message."""
+    def take(self, reader: "AnyReader", topic: str, kind: str, received_ns: int, raw: bytes, name: str) -> None:
+        """Add one message."""
         try:
             message: Any = _message(reader, raw, kind, name)
         except BrokenFrameError:
             if topic == self.image_topic:
-                self.lost.setdefault("unreadable message", []).append(name)
+                self.lost_images.setdefault("unreadable message", []).append(name)
             else:
                 self.n_lost_positions += 1
             return
         header = message.header.stamp
-        time_us = (header.sec * 10**9 + header.nanosec) // 1000 or received // 1000
+        time_us = (header.sec * 10**9 + header.nanosec) // 1000 or received_ns // 1000
         if topic == self.position_topic:
             self.rows.append((time_us, *_place(message, kind)))
         elif name in self.received_ns:
-            self.lost.setdefault("received at the time of another", []).append(name)
+            self.lost_images.setdefault("received at the time of another", []).append(name)
         else:
-            self.received_ns[name] = received
+            self.received_ns[name] = received_ns
             is_raw = kind != _COMPRESSED
             shape = f"{message.width} x {message.height}" if is_raw else shape_in(BytesIO(bytes(message.data)))
             self.shapes.append((name, shape))
             self.images.append((name, time_us + self.time_offset_us))
 
 
-def _opened(path: Path) -> "AnyReader":
-    """A reader to be entered. Raises MissingExtraError, SourceError."""
+def _bag_reader(path: Path) -> "AnyReader":
+    """A reader that has yet to be entered; raises MissingExtraError, SourceError, the latter on entering too."""
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError as error:
         raise MissingExtraError("bags and MCAP files need rosbags: pip install 'deep-simbad[rosbag]'") from error
 
-    class Reader(AnyReader):  # whose faults are named as ours
+    class Reader(AnyReader):
         def open(self) -> None:
             try:
                 super().open()
@@ -261,14 +263,16 @@ def _opened(path: Path) -> "AnyReader":
 
 
 def _messages(reader: "AnyReader", topics: set[str], **between_ns: int) -> Iterator[tuple[str, str, int, bytes]]:
-    """Topic, type, when it was received and body of every message. Raises SourceError (the bag is damaged)."""
+    """Yield (topic, type, nanoseconds of receipt, body) of every message; raises SourceError (the bag is damaged)."""
     connections = [connection for connection in reader.connections if connection.topic in topics]
     try:
-        for connection, received, raw in reader.messages(connections, **between_ns):
-            yield connection.topic, connection.msgtype, received, raw
+        for connection, received_ns, raw in reader.messages(connections, **between_ns):
+            yield connection.topic, connection.msgtype, received_ns, raw
     except Exception as error:  # rosbags lets struct's, sqlite's and its own through
-        why = _first_line(error)
-        raise SourceError(f"{reader.paths[0]} is damaged: its messages cannot be read: {why}; {_MENDED_BY}") from error
+        reason = _first_line(error)
+        raise SourceError(
+            f"{reader.paths[0]} is damaged: its messages cannot be read: {reason}; {_MENDED_BY}"
+        ) from error
 
 
 def _message(reader: "AnyReader", raw: bytes, kind: str, name: str) -> object:
@@ -282,22 +286,22 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def _chosen(asked: str, there: list[str], what: str, path: Path, *, take_first: bool = False) -> str:
-    if asked in there:
-        return asked
-    if not asked and there and (take_first or len(there) == 1):
-        return there[0]
-    if not there:
-        raise SourceError(f"{path} holds no {what}: none of its topics has a type that is read")
-    trouble = f"no {what} in {asked}" if asked else f"{what} in several topics"
-    raise SourceError(f"{path}: {trouble}: name one of {', '.join(sorted(there))} as {BAG_PREFIX}{path}#TOPIC")
+def _choose_topic(topic: str, topics: list[str], contents: str, path: Path, *, take_first: bool = False) -> str:
+    if topic in topics:
+        return topic
+    if not topic and topics and (take_first or len(topics) == 1):
+        return topics[0]
+    if not topics:
+        raise SourceError(f"{path} holds no {contents}: none of its topics has a type that is read")
+    trouble = f"no {contents} in {topic}" if topic else f"{contents} in several topics"
+    raise SourceError(f"{path}: {trouble}: name one of {', '.join(sorted(topics))} as {BAG_PREFIX}{path}#TOPIC")
 
 
 def _place(message: Any, kind: str) -> tuple[float, float, float]:
-    """Two coordinates, of a fix in degrees, and the heading; NaN: not known."""
+    """Two coordinates, a fix's in degrees, and the heading; NaN where unknown."""
     if kind == _FIX:
-        fixed = message.status.status >= 0
-        return (message.latitude if fixed else math.nan, message.longitude if fixed else math.nan, math.nan)
+        is_fixed = message.status.status >= 0
+        return (message.latitude if is_fixed else math.nan, message.longitude if is_fixed else math.nan, math.nan)
     pose = message.pose if kind == _POSES[0] else message.pose.pose
     q = pose.orientation
     heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
@@ -313,19 +317,21 @@ def _track(rows: _Rows, kind: str) -> Track | None:
     return track_of(time_us, x_m, y_m, heading_rad, deadband_m=DEADBAND_M)
 
 
-def _placed(images: list[tuple[str, int]], rows: _Rows, kind: str, where: str) -> Placed:
+def _place_images(images: list[tuple[str, int]], rows: _Rows, kind: str, source: str) -> Placement:
     track = _track(rows, kind)
     if track is None:
-        raise SourceError(f"{where}: fewer than two positions can be used")
-    result = placed_on(track, images, where)
+        raise SourceError(f"{source}: fewer than two positions can be used")
+    placement = place_on_track(track, images, source)
     if kind == _ODOMETRY:
         # x, y and heading are of this drive's own beginning and no other's
-        result.frames = [dataclasses.replace(frame, x_m=None, y_m=None, heading_rad=None) for frame in result.frames]
-    return result
+        placement.frames = [
+            dataclasses.replace(frame, x_m=None, y_m=None, heading_rad=None) for frame in placement.frames
+        ]
+    return placement
 
 
 def _pixels(message: Any, name: str) -> NDArray[Any]:
-    """A raw image as BGR, of its own depth: uint8 or uint16."""
+    """The BGR pixels of a raw image in its own depth, uint8 or uint16; raises BrokenFrameError."""
     layout = _LAYOUTS.get(message.encoding)
     if layout is None:
         raise BrokenFrameError(f"{name}: nobody reads the encoding {message.encoding!r}", "unknown encoding")

@@ -1,4 +1,4 @@
-"""Route sets that others measure on, as downloaded: where frames lie, where they were taken, when a match counts.
+"""Public benchmark sets as downloaded: the frames' files, the places they were taken at, and when a match is true.
 
     nordland:ROOT/summer         a folder a season, frame i is frame i; ROOT/cleanImageNames.txt leaves out tunnels
     gardens_point:ROOT/day_left  likewise, Image000.jpg to Image199.jpg
@@ -7,8 +7,8 @@
     svox:ROOT/images/test/gallery      names @EAST@NORTH@...@.jpg, as the common downloader writes every set
     robotcar:ROOT/2014-12-09-13-21-02  stereo/centre/UTIME.png, a raw mosaic, with gps/ins.csv (northing, easting)
 
-But for the first two, a folder shows what it is and needs no prefix. Formats: gmberton/VPR-datasets-downloader,
-mapillary/mapillary_sls, ori-mrg/robotcar-dataset-sdk.
+Except for the first two, a folder's layout shows its set and no prefix is needed. Formats:
+gmberton/VPR-datasets-downloader, mapillary/mapillary_sls, ori-mrg/robotcar-dataset-sdk.
 """
 
 import csv
@@ -36,27 +36,27 @@ from deepsimbad_client.recordings import (
 from deepsimbad_client.recordings.folder import FolderRecording
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.names import in_order, times_of
-from deepsimbad_client.recordings.placing import UNPLACED, placed, placed_on
+from deepsimbad_client.recordings.placing import UNPLACED, place_frames, place_on_track
 from deepsimbad_client.recordings.track import track_of
 from deepsimbad_client.recordings.video import read_video
 
 _CLEAN_NAMES, _VIDEO, _GPS, _PLACES = "cleanImageNames.txt", "webcam_video.avi", "fGPS.txt", "postprocessed.csv"
 _UTM_NAME = re.compile(r"@\s*-?[0-9.]+\s*@\s*-?[0-9.]+\s*@.*")
 _MOSAICS = {"stereo": cv2.COLOR_BayerGBRG2BGR, "mono": cv2.COLOR_BayerRGGB2BGR}  # by the camera's name
-_PNG_COLOUR, _PNG_GREY = 25, 0  # the header's byte that tells colours, and what it is of one channel
+_PNG_COLOUR, _PNG_GREY = 25, 0  # place of the header's byte for colours, and its value for one channel
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A set, and when papers count a match as true."""
+    """A set, and the tolerance within which papers count a match as true."""
 
     title: str
-    read: Callable[[Path, float], Recording | None]  # a drive's folder, with metres between frames; None: it is none
+    read: Callable[[Path, float], Recording | None]  # (folder, metres between frames); None: no drive of this set
     tolerance_m: float = 25.0
     tolerance_frames: int | None = None  # in place of metres, where frames alone are aligned
 
     def open(self, folder: Path, spacing_m: float, rotate: int = 0) -> Recording | None:
-        """One drive, saying what it was taken for; None: the folder is no such drive."""
+        """One drive, with a remark that names its set; None: the folder is no such drive."""
         recording = self.read(folder, spacing_m)
         if recording is None:
             return None
@@ -65,9 +65,11 @@ class Benchmark:
         frames = self.tolerance_frames
         # Half a frame more, so that no rounding decides
         tolerance_m = self.tolerance_m if frames is None else (frames + 0.5) * spacing_m
-        within = f"{self.tolerance_m:g} m" if frames is None else f"{frames} frames"
-        said = f"{self.title}: {len(recording.frames)} frames, true within {within} unless --tolerance says otherwise"
-        return dataclasses.replace(recording, tolerance_m=tolerance_m, remarks=[*recording.remarks, said])
+        tolerance = f"{self.tolerance_m:g} m" if frames is None else f"{frames} frames"
+        remark = (
+            f"{self.title}: {len(recording.frames)} frames, true within {tolerance} unless --tolerance says otherwise"
+        )
+        return dataclasses.replace(recording, tolerance_m=tolerance_m, remarks=[*recording.remarks, remark])
 
 
 def open_benchmark(place: str, spacing_m: float, rotate: int = 0) -> Recording | None:
@@ -86,10 +88,11 @@ def open_benchmark(place: str, spacing_m: float, rotate: int = 0) -> Recording |
     return recording
 
 
-def recognised(folder: Path, spacing_m: float, rotate: int = 0) -> Recording | None:
-    """The drive in a folder that shows of itself which set's layout it has; None: it shows none."""
-    own = (each for each in BENCHMARKS.values() if each.tolerance_frames is None)
-    return next((recording for each in own if (recording := each.open(folder, spacing_m, rotate))), None)
+def open_recognised(folder: Path, spacing_m: float, rotate: int = 0) -> Recording | None:
+    """The drive in a folder whose layout shows its set; None: it is no set's."""
+    candidates = (benchmark for benchmark in BENCHMARKS.values() if benchmark.tolerance_frames is None)
+    drives = (benchmark.open(folder, spacing_m, rotate) for benchmark in candidates)
+    return next(filter(None, drives), None)
 
 
 def _images(folder: Path) -> list[str]:
@@ -98,34 +101,36 @@ def _images(folder: Path) -> list[str]:
     return in_order([path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES])
 
 
-def _aligned(folder: Path, spacing_m: float) -> Recording | None:
-    """Frames by their numbers; where a list of names lies beside or above, by their places in that."""
+def _by_numbers(folder: Path, spacing_m: float) -> Recording | None:
+    """Frames placed by the numbers in their names, or by a list of clean names in or above their folder."""
     names, left_out = _images(folder), dict[str, list[str]]()
     lists = [place / _CLEAN_NAMES for place in (folder, folder.parent) if (place / _CLEAN_NAMES).is_file()]
     if lists:
-        listed = in_order([line.strip() for line in lists[0].read_text(encoding="utf-8").splitlines() if line.strip()])
-        number_of = {name: number for number, name in enumerate(listed)}
+        clean_names = in_order(
+            [line.strip() for line in lists[0].read_text(encoding="utf-8").splitlines() if line.strip()]
+        )
+        number_of = {name: number for number, name in enumerate(clean_names)}
         left_out = {f"not in {_CLEAN_NAMES}": [name for name in names if name not in number_of]}
     else:
         digits = {name: re.findall(r"[0-9]+", Path(name).stem) for name in names}
-        number_of = {name: int(found[-1]) for name, found in digits.items() if found}
+        number_of = {name: int(numbers[-1]) for name, numbers in digits.items() if numbers}
         left_out = {"without a number": [name for name in names if name not in number_of]}
-    kept = sorted((name for name in names if name in number_of), key=number_of.__getitem__)
-    frames = [Frame(index, name, number_of[name] * spacing_m) for index, name in enumerate(kept)]
-    return _recorded(folder, frames, left_out)
+    usable_names = sorted((name for name in names if name in number_of), key=number_of.__getitem__)
+    frames = [Frame(index, name, number_of[name] * spacing_m) for index, name in enumerate(usable_names)]
+    return _folder_recording(folder, frames, left_out)
 
 
-def _recorded(folder: Path, frames: Sequence[Frame], left_out: dict[str, list[str]]) -> FolderRecording | None:
+def _folder_recording(folder: Path, frames: Sequence[Frame], left_out: dict[str, list[str]]) -> FolderRecording | None:
     if not frames:
         return None
     lost = {reason: names for reason, names in left_out.items() if names}
     return FolderRecording(folder.resolve().name, tuple(frames), lost, folder=folder)
 
 
-def _along(
+def _summed_up(
     folder: Path, places: Sequence[tuple[str, float, float]], left_out: dict[str, list[str]]
 ) -> Recording | None:
-    """Images with north and east, which need be no one drive: positions add up the ways between them."""
+    """Images at (name, north, east), which need not be one drive: positions add up the ways between them."""
     if not places:
         return None
     plane = np.array([place[1:] for place in places], np.float64)
@@ -134,7 +139,7 @@ def _along(
         Frame(index, name, position_m, None, north, east)
         for index, ((name, north, east), position_m) in enumerate(zip(places, along_m, strict=True))
     ]
-    return _recorded(folder, frames, left_out)
+    return _folder_recording(folder, frames, left_out)
 
 
 def _by_utm_names(folder: Path, _: float) -> Recording | None:
@@ -142,11 +147,11 @@ def _by_utm_names(folder: Path, _: float) -> Recording | None:
     if not names or not _UTM_NAME.fullmatch(names[len(names) // 2]):
         return None
     fields = {name: name.split("@") for name in names if _UTM_NAME.fullmatch(name)}
-    # The image's own id, the seventh, orders a drive; east and north do not
-    ordered = in_order([f"{parts[7] if len(parts) > 7 else ''}\n{name}" for name, parts in fields.items()])
-    named = [(name, fields[name]) for name in (key.partition("\n")[2] for key in ordered)]
-    places = [(name, float(parts[2]), float(parts[1])) for name, parts in named]
-    return _along(folder, places, {"whose name tells no place": [name for name in names if name not in fields]})
+    # The image's id, the seventh field, orders a drive; east and north do not
+    order = in_order([f"{parts[7] if len(parts) > 7 else ''}\n{name}" for name, parts in fields.items()])
+    image_fields = [(name, fields[name]) for name in (key.partition("\n")[2] for key in order)]
+    places = [(name, float(parts[2]), float(parts[1])) for name, parts in image_fields]
+    return _summed_up(folder, places, {"whose name tells no place": [name for name in names if name not in fields]})
 
 
 def _table(path: Path) -> list[dict[str, str]]:
@@ -160,12 +165,12 @@ def _table(path: Path) -> list[dict[str, str]]:
 def _msls(folder: Path, _: float) -> Recording | None:
     if not (folder / _PLACES).is_file() or not (folder / "images").is_dir():
         return None
-    beside = {name: _table(folder / name) if (folder / name).is_file() else [] for name in ("seq_info.csv", "raw.csv")}
-    panoramas = {row.get("key") for row in beside["raw.csv"] if row.get("pano") == "True"}
+    tables = {name: _table(folder / name) if (folder / name).is_file() else [] for name in ("seq_info.csv", "raw.csv")}
+    panoramas = {row.get("key") for row in tables["raw.csv"] if row.get("pano") == "True"}
     try:
         place_of = {
             row["key"]: (row.get("sequence_key") or row.get("sequence_id") or "", int(row["frame_number"]))
-            for row in beside["seq_info.csv"]
+            for row in tables["seq_info.csv"]
         }
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(
@@ -192,7 +197,7 @@ def _msls(folder: Path, _: float) -> Recording | None:
             left_out["without a place"].append(row["key"])
         else:
             places.append((names[row["key"]], north, east))
-    recording = _along(folder / "images", places, left_out)
+    recording = _summed_up(folder / "images", places, left_out)
     return None if recording is None else dataclasses.replace(recording, name=f"{folder.parent.name}/{folder.name}")
 
 
@@ -204,18 +209,20 @@ def _st_lucia(folder: Path, spacing_m: float) -> Recording | None:
     fixes = [[finite_number(cell) for cell in line.split(",")[:2]] for line in lines]
     degrees = np.array([fix if len(fix) == 2 and None not in fix else (np.nan, np.nan) for fix in fixes], np.float64)
     north, east = utm(-np.abs(degrees[:, 0]), degrees[:, 1])  # Brisbane: the file leaves the sign out
-    seen = zip(video.frames, north.tolist(), east.tolist(), strict=False)
-    frames = [dataclasses.replace(frame, position_m=UNPLACED, x_m=x, y_m=y) for frame, x, y in seen if np.isfinite(x)]
-    result = placed(frames, str(folder / _GPS), GPS_DEADBAND_M)
+    frame_places = zip(video.frames, north.tolist(), east.tolist(), strict=False)
+    frames = [
+        dataclasses.replace(frame, position_m=UNPLACED, x_m=x, y_m=y) for frame, x, y in frame_places if np.isfinite(x)
+    ]
+    placement = place_frames(frames, str(folder / _GPS), GPS_DEADBAND_M)
     return dataclasses.replace(
-        video, name=folder.resolve().name, frames=tuple(result.frames), left_out_names=result.left_out_names,
-        remarks=result.remarks,
+        video, name=folder.resolve().name, frames=tuple(placement.frames), left_out_names=placement.left_out_names,
+        remarks=placement.remarks,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MosaicRecording(FolderRecording):
-    """Images of which every pixel holds one colour, as the sensor gave them."""
+    """Raw images of which every pixel holds one colour."""
 
     pattern: int  # OpenCV's code of the mosaic
 
@@ -224,7 +231,7 @@ class MosaicRecording(FolderRecording):
         path = self.folder / frame.name
         body = read_file(path)
         if body[_PNG_COLOUR : _PNG_COLOUR + 1] != bytes([_PNG_GREY]):
-            return super().image(frame, input_size)  # somebody made it colours already
+            return super().image(frame, input_size)  # it has been converted to colours already
         colours = np.asarray(cv2.cvtColor(decode(body, path)[..., 0], self.pattern), np.uint8)
         return as_png(turned(colours, self.rotate), input_size)
 
@@ -244,15 +251,15 @@ def _robotcar(folder: Path, _: float) -> Recording | None:
     track = track_of(*values)
     if track is None:
         raise SourceError(f"{poses}: fewer than two rows hold {', '.join(columns)}")
-    result = placed_on(track, list(zip(names, times_us, strict=True)), str(poses))
+    placement = place_on_track(track, list(zip(names, times_us, strict=True)), str(poses))
     pattern = _MOSAICS["mono" if camera.name.startswith("mono") else "stereo"]
     name = folder.resolve().name
-    return MosaicRecording(name, tuple(result.frames), result.left_out_names, folder=camera, pattern=pattern)
+    return MosaicRecording(name, tuple(placement.frames), placement.left_out_names, folder=camera, pattern=pattern)
 
 
 BENCHMARKS = {
-    "nordland": Benchmark("Nordland", _aligned, tolerance_frames=10),
-    "gardens_point": Benchmark("Gardens Point", _aligned, tolerance_frames=2),
+    "nordland": Benchmark("Nordland", _by_numbers, tolerance_frames=10),
+    "gardens_point": Benchmark("Gardens Point", _by_numbers, tolerance_frames=2),
     "st_lucia": Benchmark("St Lucia", _st_lucia),
     "msls": Benchmark("MSLS", _msls),
     "robotcar": Benchmark("RobotCar", _robotcar),

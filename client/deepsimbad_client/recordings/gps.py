@@ -1,6 +1,6 @@
-"""Where a receiver was: GPX and NMEA files as tracks, and what EXIF says of an image's place and time.
+"""GPX and NMEA files as tracks of a receiver, and an image's place and time by its EXIF.
 
-From latitude and longitude to metres goes UTM, so that two drives of one place have one plane.
+UTM takes latitude and longitude to metres, so that two drives of one place have one plane.
 """
 
 import math
@@ -22,9 +22,9 @@ from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings.track import Reals, Track, track_of
 
 TRACK_SUFFIXES = (".gpx", ".nmea")
-_GPS, _EXIF = 0x8825, 0x8769  # EXIF's folders, and tags in them
+_GPS, _EXIF = 0x8825, 0x8769  # EXIF's folders; below them their tags
 _LATITUDE, _LONGITUDE, _GPS_TIME, _GPS_DATE = (1, 2), (3, 4), 7, 29
-_TAKEN, _SUBSECOND, _ZONE = 36867, 37521, 36881
+_DATE_TAKEN, _SUBSECOND, _ZONE = 36867, 37521, 36881
 
 _SIDES = {"N": 1, "E": 1, "S": -1, "W": -1}
 
@@ -32,7 +32,7 @@ _Fix = tuple[int, float, float]  # microseconds, degrees north, degrees east
 
 
 def read_track(path: Path) -> Track:
-    """Read a GPX or NMEA file; raises SourceError (it is none, or fewer than two of its fixes can be used)."""
+    """Read a GPX or NMEA file; raises SourceError (it is neither, or fewer than two of its fixes can be used)."""
     try:
         rows = list(_gpx(path) if path.suffix.lower() == ".gpx" else _nmea(path))
     except (OSError, ParseError, ValueError) as error:
@@ -42,14 +42,16 @@ def read_track(path: Path) -> Track:
     degrees = np.array([fix[1:] for fix in fixes], np.float64).reshape(-1, 2)
     track = track_of(time_us, *utm(degrees[:, 0], degrees[:, 1]), deadband_m=GPS_DEADBAND_M)
     if track is None:
-        what = "track points" if path.suffix.lower() == ".gpx" else "RMC sentences, which alone say the date,"
-        raise SourceError(f"{path}: of its {len(rows)} {what} fewer than two hold a time and a place that can be used")
+        rows_name = "track points" if path.suffix.lower() == ".gpx" else "RMC sentences, which alone say the date,"
+        raise SourceError(
+            f"{path}: of its {len(rows)} {rows_name} fewer than two hold a time and a place that can be used"
+        )
     n_skipped_rows = track.n_skipped_rows + len(rows) - len(fixes)
     return replace(track, n_skipped_rows=n_skipped_rows, remarks=zone_remarks(degrees[:, 0], degrees[:, 1]))
 
 
 def _gpx(path: Path) -> Iterator[_Fix | None]:
-    """Track points of every version's namespace; None: one without a time and a place that can be read."""
+    """Yield a GPX file's track points, of any version; None for one without a readable time and place."""
     with path.open("rb") as file:
         for _, point in iterparse(file):  # noqa: S314 - expat itself stops entities that grow
             if point.tag.rpartition("}")[2] == "trkpt":
@@ -66,7 +68,7 @@ def _gpx_fix(point: Any) -> _Fix | None:
 
 
 def _nmea(path: Path) -> Iterator[_Fix | None]:
-    """Recommended minimum sentences (RMC), which alone say the date; None: one without a fix, or damaged."""
+    """Yield the fixes of RMC sentences, which alone state the date; None for one without a fix, or damaged."""
     for line in path.read_text(encoding="ascii", errors="replace").splitlines():
         sentence, _, checksum = line.strip().rpartition("$")[2].partition("*")
         cells = sentence.split(",")
@@ -80,16 +82,16 @@ def _nmea_fix(sentence: str, cells: list[str], checksum: str) -> _Fix | None:
     with suppress(ValueError, KeyError):
         if checksum and int(checksum[:2], 16) != reduce(xor, sentence.encode(), 0):
             return None
-        time = datetime.strptime(f"{cells[9]} {cells[1][:6]}", "%d%m%y %H%M%S").replace(tzinfo=UTC)
-        since = timedelta(seconds=float(f"0{cells[1][6:]}"))
-        return _microseconds(time + since), _angle(*cells[3:5]), _angle(*cells[5:7])
+        second = datetime.strptime(f"{cells[9]} {cells[1][:6]}", "%d%m%y %H%M%S").replace(tzinfo=UTC)
+        fraction = timedelta(seconds=float(f"0{cells[1][6:]}"))
+        return _microseconds(second + fraction), _angle(*cells[3:5]), _angle(*cells[5:7])
     return None
 
 
 def _angle(text: str, side: str) -> float:
-    """Degrees of DDDMM.MMMM and N, S, E or W."""
-    whole, minutes = divmod(float(text), 100)
-    return (whole + minutes / 60) * _SIDES[side]
+    """Degrees from the text DDDMM.MMMM and the side N, S, E or W."""
+    degrees, minutes = divmod(float(text), 100)
+    return (degrees + minutes / 60) * _SIDES[side]
 
 
 def _microseconds(time: datetime) -> int:
@@ -98,8 +100,8 @@ def _microseconds(time: datetime) -> int:
 
 
 @dataclass(frozen=True)
-class Taken:
-    """What EXIF says; NaN, None: nothing."""
+class ExifFix:
+    """An image's place and time by its EXIF; NaN or None where it states none."""
 
     latitude: float = math.nan
     longitude: float = math.nan
@@ -107,27 +109,27 @@ class Taken:
     in_zone: bool = False  # the time says its zone, or is the receiver's; else it is read as UTC
 
 
-def read_exif(path: Path) -> Taken:
-    """Where and when an image was taken."""
+def read_exif(path: Path) -> ExifFix:
+    """The place and time where an image was taken, by its EXIF."""
     try:
         with Pictures.open(path) as picture:
             exif = picture.getexif()
             gps, details = exif.get_ifd(_GPS), exif.get_ifd(_EXIF)
     except (OSError, ValueError, SyntaxError, Pictures.DecompressionBombError):
-        return Taken()
+        return ExifFix()
     latitude, longitude = _exif_degrees(gps, *_LATITUDE), _exif_degrees(gps, *_LONGITUDE)
     with suppress(KeyError, ValueError, TypeError, ZeroDivisionError):
         hours, minutes, seconds = (float(part) for part in gps[_GPS_TIME])
         day = datetime.strptime(gps[_GPS_DATE], "%Y:%m:%d").replace(tzinfo=UTC)
-        since = timedelta(hours=hours, minutes=minutes, seconds=seconds)
-        return Taken(latitude, longitude, _microseconds(day + since), in_zone=True)
+        time_of_day = timedelta(hours=hours, minutes=minutes, seconds=seconds)
+        return ExifFix(latitude, longitude, _microseconds(day + time_of_day), in_zone=True)
     with suppress(KeyError, ValueError, TypeError):
-        taken = datetime.strptime(details[_TAKEN], "%Y:%m:%d %H:%M:%S")
+        date = datetime.strptime(details[_DATE_TAKEN], "%Y:%m:%d %H:%M:%S")
         zone = str(details.get(_ZONE, ""))
         subsecond = float(f"0.{str(details.get(_SUBSECOND, 0)).strip()}")
-        time = datetime.fromisoformat(f"{taken.isoformat()}{zone}") + timedelta(seconds=subsecond)
-        return Taken(latitude, longitude, _microseconds(time), in_zone=bool(zone))
-    return Taken(latitude, longitude)
+        time = datetime.fromisoformat(f"{date.isoformat()}{zone}") + timedelta(seconds=subsecond)
+        return ExifFix(latitude, longitude, _microseconds(time), in_zone=bool(zone))
+    return ExifFix(latitude, longitude)
 
 
 def _exif_degrees(gps: dict[int, Any], side: int, angle: int) -> float:
@@ -147,12 +149,12 @@ _ALPHA = (
     13 / 48 * _N**2 - 3 / 5 * _N**3,
     61 / 240 * _N**3,
 )  # Krueger's series: better than a millimetre within a zone
-GPS_DEADBAND_M = 3.0  # A receiver's fix wanders by so much while it stands
+GPS_DEADBAND_M = 3.0  # by which the fixes of a standing receiver wander
 
 
 def zone_remarks(latitude: Reals, longitude: Reals) -> list[str]:
-    """What is to be said of places [n] in degrees that lie in several zones."""
-    longitude = longitude[~_unknown(latitude, longitude)]
+    """A remark where places [n] in degrees lie in several UTM zones; empty where they lie in one."""
+    longitude = longitude[~_is_unknown(latitude, longitude)]
     zones = np.unique(np.floor(longitude / 6)) % 60 + 31
     if len(zones) < 2:
         return []
@@ -167,9 +169,9 @@ def zone_remarks(latitude: Reals, longitude: Reals) -> list[str]:
 def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
     """North and east [n] in metres of places [n] in degrees, all in the zone of their median; NaN stays NaN.
 
-    Places south of the equator have negative norths. 0, 0 is what receivers say that know nothing: it becomes NaN.
+    Places south of the equator have negative norths. Receivers without a fix state 0, 0: it becomes NaN.
     """
-    unknown = _unknown(latitude, longitude)
+    unknown = _is_unknown(latitude, longitude)
     if unknown.all():
         return np.full(len(latitude), np.nan), np.full(len(latitude), np.nan)
     centre = np.floor(np.median(longitude[~unknown]) / 6) * 6 + 3
@@ -185,7 +187,7 @@ def utm(latitude: Reals, longitude: Reals) -> tuple[Reals, Reals]:
     return _SCALE * _MERIDIAN_M * north, _FALSE_EAST_M + _SCALE * _MERIDIAN_M * east
 
 
-def _unknown(latitude: Reals, longitude: Reals) -> NDArray[np.bool_]:
-    """Which of places [n] in degrees are none."""
+def _is_unknown(latitude: Reals, longitude: Reals) -> NDArray[np.bool_]:
+    """[n] whether each of places [n] in degrees is unknown."""
     is_origin = (latitude == 0) & (longitude == 0)
     return np.asarray(is_origin | ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)))

@@ -1,4 +1,4 @@
-"""Names and times of frames as recordings write them: the order of names, which file one means, the unit of times."""
+"""Names and times of frames as recordings write them: their order, the file that one means, the unit of times."""
 
 import re
 import unicodedata
@@ -55,13 +55,13 @@ _WORD = Decimal("-Infinity")
 
 
 def stem(name: str) -> str:
-    """A file's name without its ending; what follows a dot and is a number is no ending."""
-    before, _, ending = name.rpartition(".")
-    return before if before and not ending.isdigit() else name
+    """A file's name without its ending; a number behind a dot is no ending."""
+    base, _, ending = name.rpartition(".")
+    return base if base and not ending.isdigit() else name
 
 
 def _pointed(name: str) -> str:
-    """A name's stem, with points for decimal commas, and seconds and nanoseconds one number."""
+    """A name's stem, with points for decimal commas, and seconds and nanoseconds as one number."""
     return _STAMP.sub(r"\1.\2", _DECIMAL_COMMA.sub(".", stem(name)))
 
 
@@ -70,56 +70,56 @@ def _number(name: str) -> Decimal | None:
 
 
 def unit_of(time: Decimal) -> str | None:
-    """The unit in which a number is a time since 1970 between 1990 and 2100; None: in none."""
+    """The unit in which a number of time since 1970 lies between 1990 and 2100; None: in no unit."""
     return next((unit for unit, in_us in UNITS.items() if FIRST_US <= time * in_us < LAST_US), None)
 
 
-def times_us(cells: Sequence[str], unit: str | None, where: Sequence[str]) -> tuple[list[int | None], str | None]:
+def times_us(cells: Sequence[str], unit: str | None, locations: Sequence[str]) -> tuple[list[int | None], str | None]:
     """Whole microseconds of the cells of a column, None where one says nothing; and the unit they are in.
 
-    `unit` is what the column's name says; numbers that are times of day since 1970 in another one are of that other
-    one. `where` names each cell in errors. Raises SourceError (no time, or of a unit that cannot be told).
+    `unit` is what the column's name says; numbers that are times since 1970 in another unit are of that other one.
+    `locations` name the cells in errors. Raises SourceError (no time, or of a unit that cannot be told).
     """
-    numbers = [_time(cell, place) for cell, place in zip(cells, where, strict=True)]
-    known = [(number, place) for number, place in zip(numbers, where, strict=True) if number]
-    units = {unit_of(number): place for number, place in known}
+    numbers = [_time(cell, location) for cell, location in zip(cells, locations, strict=True)]
+    timed_cells = [(number, location) for number, location in zip(numbers, locations, strict=True) if number]
+    units = {unit_of(number): location for number, location in timed_cells}
     if len(units) > 1:
-        mixed = "; ".join(f"{place} is in {unit_ or 'none'}" for unit_, place in units.items())
+        mixed = "; ".join(f"{location} is in {unit_ or 'none'}" for unit_, location in units.items())
         raise SourceError(f"times of several units: {mixed}; write all of them in microseconds (timestamp_us)")
     unit = next(iter(units), None) or unit
-    if unit is None and known:
+    if unit is None and timed_cells:
         raise SourceError(
-            f"{known[0][1]}: nobody can tell the unit of the time {known[0][0]}: name the column timestamp_s, "
-            "timestamp_ms, timestamp_us or timestamp_ns"
+            f"{timed_cells[0][1]}: nobody can tell the unit of the time {timed_cells[0][0]}: name the column "
+            "timestamp_s, timestamp_ms, timestamp_us or timestamp_ns"
         )
     if unit is None:
         return [None] * len(cells), None
-    since_1970 = unit in units  # there 0 is no time but its absence
+    since_1970 = unit in units  # then 0 says that there is no time
     times: list[int | None] = []
-    for number, place in zip(numbers, where, strict=True):
+    for number, location in zip(numbers, locations, strict=True):
         if number is not None and abs(number) * UNITS[unit] >= LAST_US:
-            raise SourceError(f"{place}: {number} {unit} is no time, it is after the year 2100")
+            raise SourceError(f"{location}: {number} {unit} is no time, it is after the year 2100")
         times.append(None if number is None or (since_1970 and not number) else round(number * UNITS[unit]))
     return times, unit
 
 
-def _time(cell: str, where: str) -> Decimal | None:
+def _time(cell: str, location: str) -> Decimal | None:
     if cell.lower() in UNKNOWN:
         return None
     with suppress(InvalidOperation):
         number = Decimal(cell)
         if not number.is_finite():
-            raise SourceError(f"{where}: {cell!r} is not a time")
+            raise SourceError(f"{location}: {cell!r} is not a time")
         return number
     try:
         date = datetime.fromisoformat(cell)
     except ValueError as error:
-        raise SourceError(f"{where}: {cell!r} is not a time") from error
+        raise SourceError(f"{location}: {cell!r} is not a time") from error
     return Decimal(round((date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp() * 1e6)) / 10**6
 
 
 def times_of(names: Sequence[str]) -> list[int] | None:
-    """Unix microseconds, where all names end in a time since 1970 of one unit (s, ms, us or ns); else None."""
+    """Unix microseconds of the names, if all end in a time since 1970 of one unit (s, ms, us or ns); else None."""
     tokens = [_DECIMALS.split(_pointed(name))[1::2] for name in names]
     numbers = [Decimal(parts[-1]) for parts in tokens if parts]
     units = {unit_of(number) for number in numbers}
@@ -128,7 +128,7 @@ def times_of(names: Sequence[str]) -> list[int] | None:
 
 
 def dates_in(names: Sequence[str]) -> list[datetime] | None:
-    """Moments, of whatever time zone, where all names hold a date and a time of day."""
+    """The moments in the names, read as UTC, if all hold a date and a time of day; else None."""
     figures = [" ".join(match.groups()) for match in map(_DATE.search, names) if match]
     try:
         dates = [datetime.strptime(date, "%Y %m %d %H %M %S").replace(tzinfo=UTC) for date in figures]
@@ -138,36 +138,36 @@ def dates_in(names: Sequence[str]) -> list[datetime] | None:
 
 
 def counted_anew(names: Sequence[str]) -> list[int]:
-    """Where the last number in names begins anew behind another beginning, as in a_1_28, a_1_29, a_2_0, a_2_1.
+    """Indices where the last number in names begins anew behind another beginning, as in a_1_28, a_1_29, a_2_0, a_2_1.
 
-    Not where that is a clock's, or the last digits of one number, or the names say that they are parts.
+    Empty where that number is a clock's, or the last digits of one number, or the names say that they are parts.
     """
     parts = [_DECIMALS.split(_pointed(name)) for name in names]
     if any(len(part) < 4 for part in parts):
         return []
     numbers = [Decimal(part[-2]) for part in parts]
     beginnings = ["".join(part[:-2]) for part in parts]
-    places = [at for at, (before, after) in enumerate(pairwise(beginnings), 1) if before != after]
-    steps = [after - before for before, after in pairwise(numbers)]
+    places = [index for index, (left, right) in enumerate(pairwise(beginnings), 1) if left != right]
+    steps = [right - left for left, right in pairwise(numbers)]
     is_clock = all(len(part[-2]) == len(part[-4]) == 2 and Decimal(part[-2]) < 60 for part in parts)
     is_digit = re.fullmatch(r"10*", str(max(numbers) + 1))
     is_part = all(map(_PART.search, beginnings)) or len(set(beginnings)) != len(places) + 1
     if is_clock or is_digit or is_part:
         return []
-    counts = all(step <= 0 if at in places else 0 < step <= _LONGEST_STEP for at, step in enumerate(steps, 1))
+    counts = all(step <= 0 if index in places else 0 < step <= _LONGEST_STEP for index, step in enumerate(steps, 1))
     return places if counts else []
 
 
 class Finder:
-    """Which of some files a spelling means: with or without folders of any system, ending and letter case."""
+    """Finds the file that a spelling means: with or without folders of any system, ending and letter case."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._tables = [(key, _unambiguous(names, key)) for key in _KEYS]
 
     def find(self, spelling: str) -> str | None:
-        """The file; None: there is none, or several could be meant."""
-        written = PureWindowsPath(spelling).name  # which takes both separators
-        return next((files[key(written)] for key, files in self._tables if key(written) in files), None)
+        """The file that `spelling` means; None: there is none, or several could be meant."""
+        file_name = PureWindowsPath(spelling).name  # takes both separators
+        return next((files[key(file_name)] for key, files in self._tables if key(file_name) in files), None)
 
 
 def _folded(name: str) -> str:
@@ -187,4 +187,4 @@ def _unambiguous(names: Sequence[str], key: Callable[[str], Hashable]) -> dict[H
     files: dict[Hashable, list[str]] = {}
     for name in names:
         files.setdefault(key(PureWindowsPath(name).name), []).append(name)
-    return {text: same[0] for text, same in files.items() if len(same) == 1 and text is not None}
+    return {text: candidates[0] for text, candidates in files.items() if len(candidates) == 1 and text is not None}

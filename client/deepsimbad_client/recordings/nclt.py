@@ -1,7 +1,7 @@
 """Recordings of the NCLT dataset (Carlevaris-Bianco, Ushani, Eustice, IJRR 2016), as they lie on disk.
 
-One date is one drive. Images are `<utime>.tiff` in a folder per camera, stored lying on their side; ground truth is
-a csv of 100-150 poses a second. People unpack the archives in several ways and all of these are found:
+One date is one drive. Images are `<utime>.tiff` in a folder for each camera, stored lying on their side; ground truth
+is a csv of 100-150 poses a second. The archives may be unpacked in any of these ways:
 
     ROOT/DATE/lb3/Cam5                        ROOT/ground_truth/groundtruth_DATE.csv
     ROOT/images/DATE/lb3/Cam5                 ROOT/DATE/groundtruth_DATE.csv
@@ -11,9 +11,9 @@ a csv of 100-150 poses a second. People unpack the archives in several ways and 
 The Ladybug3's lenses are undone with the dataset's own look-up tables (`U2D_Cam<k>_1616X1232.txt`): a header line, then
 `row col v u` for every pixel of the undistorted image, saying where in the stored one to look.
 
-Ground truth is `utime,x,y,z,roll,pitch,yaw` a row: microseconds, metres in the local frame of all drives (x north, y
+A row of ground truth is `utime,x,y,z,roll,pitch,yaw`: microseconds, metres in the local frame of all drives (x north, y
 east, z down), radians. Rows that are not seven finite numbers are counted and not used. Route position is metres along
-the track, unmoved by a robot that stands still: see `arc_length_m`.
+the track, which do not grow while the robot stands: see `arc_length_m`.
 """
 
 import re
@@ -42,7 +42,7 @@ from deepsimbad_client.recordings import (
     stamp_of,
     turned,
 )
-from deepsimbad_client.recordings.placing import placed_on
+from deepsimbad_client.recordings.placing import place_on_track
 from deepsimbad_client.recordings.track import Reals, Track, track_of
 
 FRONT_CAMERA = 5
@@ -76,7 +76,7 @@ class UndistortionMap:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NcltRecording(Recording):
-    """The frames of one camera on one date that have ground truth, in time order, with all that it tells of them.
+    """The frames of one camera on one date that have ground truth, in time order.
 
     Left out are those "before or after the ground truth", in a "gap in the ground truth", "missing in Cam<k>" (another
     camera has an image of that time), and where the "file name is not a time".
@@ -85,10 +85,10 @@ class NcltRecording(Recording):
     folder: Path  # the camera's
     probes: Sequence[str]  # file names of a few frames spread over the drive
     undistortion: UndistortionMap | None = None  # applied before an image is turned upright
-    rotate: int | None = None  # degrees clockwise; None: upright, which copies that are higher than wide are already
+    rotate: int | None = None  # degrees clockwise; None: upright; copies higher than wide are upright already
 
     def stamp(self, frame: Frame) -> str:
-        """Of its file; see `Recording.stamp`."""
+        """The stamp of the frame's file; see `Recording.stamp`."""
         return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
@@ -112,7 +112,7 @@ class NcltRecording(Recording):
 
     @cached_property
     def stored_size(self) -> tuple[int, int]:
-        """(width, height) of this recording's images as stored: the undistortion table's, or what most probes have."""
+        """(width, height) of this recording's images as stored: the undistortion table's, or that of most probes."""
         if self.undistortion is not None:
             return self.undistortion.size
         sizes: Counter[tuple[int, int]] = Counter()
@@ -122,8 +122,8 @@ class NcltRecording(Recording):
             except BrokenFrameError:
                 continue
             sizes[image.shape[1], image.shape[0]] += 1
-        most = max(sizes.values(), default=0)
-        commonest = [size for size, n in sizes.items() if n == most]
+        n_most = max(sizes.values(), default=0)
+        commonest = [size for size, n in sizes.items() if n == n_most]
         return commonest[0] if commonest and NCLT_STORED_SIZE not in commonest else NCLT_STORED_SIZE
 
     def _stored(self, name: str) -> Image:
@@ -134,7 +134,7 @@ class NcltRecording(Recording):
 def lies_on_its_side(path: Path) -> bool:
     """Whether an image is one of NCLT's, by its folder (lb3/Cam5) or its name (Unix microseconds), lying as stored.
 
-    A file that cannot be read is none.
+    False for a file that cannot be read.
     """
     in_layout = bool(_CAMERA.fullmatch(path.parent.name)) and path.parent.parent.name.startswith("lb3")
     if not in_layout and not _UTIME.fullmatch(path.stem):
@@ -157,35 +157,37 @@ def read_nclt(
 ) -> NcltRecording:
     """Open one date (2012-01-22) of NCLT, whose folders are below `root`; camera 5 looks forward, 0 up.
 
-    Frames may be copies in another format, smaller, undistorted or turned upright; `folder` names theirs.
-    `undistortion` is a `U2D_Cam<k>_*.txt` or the folder of them; None: images stay as the lens made them. Raises
-    SourceError (no images, no ground truth, or no image that has ground truth).
+    Frames may be copies in another format, smaller, undistorted or turned upright, in `folder`. `undistortion` is a
+    `U2D_Cam<k>_*.txt` or the folder of them; None: images stay as the lens made them. Raises SourceError (no images, no
+    ground truth, or no image that has ground truth).
     """
     if not 0 <= camera < N_CAMERAS:
         raise SourceError(f"camera {camera}: NCLT has cameras 0 to {N_CAMERAS - 1}; 5 looks forward")
     if folder is None:
-        places = [above / date / "lb3" / f"Cam{camera}" for above in (root, root / "images")]
-        for above in (root, root / "images"):
-            places += sorted((above / date).glob(f"lb3*/Cam{camera}*"))
+        places = [parent / date / "lb3" / f"Cam{camera}" for parent in (root, root / "images")]
+        for parent in (root, root / "images"):
+            places += sorted((parent / date).glob(f"lb3*/Cam{camera}*"))
         folder = _first(f"images of NCLT {date}", places, Path.is_dir, drives_in(root / date, root))
     truth = read_ground_truth(_first(f"ground truth of NCLT {date}", ground_truth_files(root, date), Path.is_file))
     names, not_times = _images_by_time(folder)
     if not names:
         raise SourceError(f"{folder} holds no image named <utime>.tiff (nor .jpg, .png or another format)")
-    result = placed_on(truth, [(name, time) for time, name in sorted(names.items())], str(folder), "the ground truth")
+    placement = place_on_track(
+        truth, [(name, time) for time, name in sorted(names.items())], str(folder), "the ground truth"
+    )
     left_out = {
-        **result.left_out_names,
+        **placement.left_out_names,
         f"missing in Cam{camera}": _missing(folder, names),
         "file name is not a time": not_times,
     }
-    probed = np.unique(np.linspace(0, len(result.frames) - 1, N_SIZE_PROBES).round().astype(int))
+    probe_rows = np.unique(np.linspace(0, len(placement.frames) - 1, N_SIZE_PROBES).round().astype(int))
     return NcltRecording(
         name=date,
-        frames=tuple(result.frames),
+        frames=tuple(placement.frames),
         left_out_names={reason: files for reason, files in left_out.items() if files},
-        remarks=result.remarks,
+        remarks=placement.remarks,
         folder=folder,
-        probes=[result.frames[place].name for place in probed],
+        probes=[placement.frames[place].name for place in probe_rows],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
         rotate=rotate,
         camera=f"Cam{camera}",
@@ -193,7 +195,7 @@ def read_nclt(
 
 
 def ground_truth_files(root: Path, date: str) -> list[Path]:
-    """Where a date's ground truth may lie."""
+    """The paths where a date's ground truth may lie."""
     return [
         root / "ground_truth" / f"groundtruth_{date}.csv",
         root / date / f"groundtruth_{date}.csv",
@@ -202,21 +204,21 @@ def ground_truth_files(root: Path, date: str) -> list[Path]:
     ]
 
 
-def _first(what: str, places: Sequence[Path], is_there: Callable[[Path], bool], near: str = "") -> Path:
+def _first(description: str, places: Sequence[Path], is_there: Callable[[Path], bool], near: str = "") -> Path:
     for place in places:
         if is_there(place):
             return place
-    raise SourceError(f"no {what}: looked for {', '.join(map(str, places))}{near}")
+    raise SourceError(f"no {description}: looked for {', '.join(map(str, places))}{near}")
 
 
 def drives_in(*roots: Path) -> str:
-    """What to say of the drives that lie in the first of some folders to hold any."""
-    found = [sorted(f"nclt:{images.parent}" for images in root.glob("*/lb3")) for root in roots]
-    return next((f"; there is {', '.join(drives)}" for drives in found if drives), "")
+    """Words for the drives in the first of some folders to hold any; "" where none does."""
+    names_by_root = [sorted(f"nclt:{images.parent}" for images in root.glob("*/lb3")) for root in roots]
+    return next((f"; there is {', '.join(drives)}" for drives in names_by_root if drives), "")
 
 
 def _images_by_time(folder: Path) -> tuple[dict[int, str], list[str]]:
-    """List a camera's folder: Unix microseconds -> file name, a TIFF's before a copy's; the images not named so."""
+    """A camera's images by Unix microseconds, a TIFF rather than its copy, and the names of images that are no time."""
     try:
         paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "."]
     except OSError as error:
@@ -227,18 +229,18 @@ def _images_by_time(folder: Path) -> tuple[dict[int, str], list[str]]:
 
 
 def _missing(folder: Path, names: Mapping[int, str]) -> list[str]:
-    """Files of the other cameras on disk, of times of exposure that this one lacks."""
-    others: dict[int, str] = {}
-    for other in folder.parent.glob("Cam[0-9]"):
-        if other != folder and other.is_dir():
-            others |= _images_by_time(other)[0]
-    return [others[time] for time in sorted(others.keys() - names.keys())]
+    """Files of the other cameras' images at times of which this camera's `folder` has none."""
+    other_names: dict[int, str] = {}
+    for camera_folder in folder.parent.glob("Cam[0-9]"):
+        if camera_folder != folder and camera_folder.is_dir():
+            other_names |= _images_by_time(camera_folder)[0]
+    return [other_names[time] for time in sorted(other_names.keys() - names.keys())]
 
 
 def read_undistortion(path: Path, camera: int) -> UndistortionMap:
     """Read a table, `path` itself or the camera's own in the folder `path`; raises SourceError.
 
-    The pixels' own rows and columns say where they go, so their order does not matter; they must form a complete grid.
+    The order of its lines does not matter, for each names its pixel; they must form a complete grid.
     """
     if path.is_dir():
         tables = sorted(path.glob(f"U2D_Cam{camera}_*.txt"))
@@ -266,7 +268,7 @@ def read_undistortion(path: Path, camera: int) -> UndistortionMap:
 
 
 def read_ground_truth(path: Path) -> Track:
-    """Read a ground-truth file in whatever state it is: rows out of order are sorted, of one time the first stays.
+    """Read a ground-truth file in whatever state it is: rows out of order are sorted, of equal times the first is used.
 
     Raises SourceError (it cannot be read, or fewer than two usable rows are in it).
     """
@@ -286,7 +288,7 @@ def read_ground_truth(path: Path) -> Track:
 
 
 def _rows(path: Path) -> Reals:
-    """Read every row [m, 7] float64; one that is not seven numbers becomes NaN."""
+    """Read all rows [m, 7] float64; one that is not seven numbers becomes NaN."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # numpy's word for an empty file; we say it better

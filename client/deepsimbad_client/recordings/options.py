@@ -1,4 +1,4 @@
-"""What the commands of client and service ask about a recording, and how they open it."""
+"""The options by which the commands of client and service open a recording, and its remarks on standard error."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
@@ -62,12 +62,12 @@ _NAMES = ("spacing_m", "undistortion", "rotate", "time_offset_s", "every_s", "ev
 
 
 def reading(command: Command) -> Command:
-    """Options of every command that reads a recording; given on as `reading`, arguments of `open_recording`."""
+    """Add the options of commands that read a recording; they arrive as `reading`, arguments of `open_recording`."""
 
     @wraps(command)
     def with_reading(**options: Any) -> Any:
-        asked = {name: options.pop(name) for name in _NAMES}
-        return command(reading=asked, **options)
+        reading_options = {name: options.pop(name) for name in _NAMES}
+        return command(reading=reading_options, **options)
 
     for option in reversed(_OPTIONS):
         with_reading = option(with_reading)
@@ -75,7 +75,7 @@ def reading(command: Command) -> Command:
 
 
 def accounting(command: Command) -> Command:
-    """Options of every command that uses a whole recording: what becomes of frames that cannot be used."""
+    """Add the options of commands that use a whole recording, about frames that cannot be used."""
     missing = click.option(
         "--allow-missing", is_flag=True, help=f"Go on where more than {MOST_LEFT_OUT:.0%} of the frames are left out."
     )
@@ -83,7 +83,7 @@ def accounting(command: Command) -> Command:
 
 
 def open_recording(source: str, allow_missing: bool = True, *, closed: bool = False, **reading: Any) -> Recording:
-    """Open a SOURCE, one turn of a closed route, telling on standard error what it was taken for.
+    """Open a SOURCE, of a closed route one turn, with its remarks on standard error.
 
     Raises SourceError, TooManyLeftOutError, click.UsageError (an option does not go with the recording).
     """
@@ -101,13 +101,13 @@ def open_recording(source: str, allow_missing: bool = True, *, closed: bool = Fa
 
 
 def tell_remarks(recording: Recording) -> None:
-    """Say on standard error what a recording was taken for."""
+    """Write a recording's remarks to standard error."""
     for remark in recording.remarks:
         click.echo(f"{recording.name}: {remark}", err=True)
 
 
 def tell_left_out(names: Mapping[str, Sequence[str]], recording: str, *, verbose: bool) -> None:
-    """Say on standard error what is left out of a recording."""
+    """Write to standard error which frames of a recording are left out."""
     for line in left_out_lines(names, verbose=verbose):
         click.echo(f"{recording}: {line}", err=True)
 
@@ -119,11 +119,12 @@ def views(
     levels: GreyLevels | None,
     rotate: int | None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every view with its name, made ready as an upload would make it, so that it is encoded like a map's own.
+    """Yield every view with its name, made ready as an upload would make it, so that it is encoded like a map's own.
 
-    Files of images or of what is told, and SOURCEs, whose frames are views. Raises SourceError, BrokenFrameError.
+    `images` are files of images or annotations, and SOURCEs, whose frames are views. Raises SourceError,
+    BrokenFrameError.
     """
-    said: set[str] = set()  # of many files once
+    printed_remarks: set[str] = set()  # so that a remark on many files is printed once
     for name in images:
         path = Path(name)
         if path.is_file() and path.suffix.lower() in ANNOTATION_SUFFIXES:
@@ -132,9 +133,9 @@ def views(
         is_image = path.is_file() and path.suffix.lower() not in RECORDING_SUFFIXES
         if is_image:
             recording: Recording = single(path, rotate)
-            if not said.issuperset(recording.remarks):
+            if not printed_remarks.issuperset(recording.remarks):
                 tell_remarks(recording)
-            said.update(recording.remarks)
+            printed_remarks.update(recording.remarks)
         else:
             recording = open_recording(name, rotate=rotate)
             tell_left_out(recording.left_out_names, recording.name, verbose=False)

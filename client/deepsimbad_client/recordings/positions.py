@@ -1,7 +1,7 @@
 """`positions.csv`: where the images beside it were taken.
 
-A header and one line for each image, cells between commas, or semicolons or tabs (then 0,5 is a half). Columns, in any
-order, others are ignored, and so is a # before the first:
+A header and one line for each image, cells between commas, or semicolons or tabs (then 0,5 is a half). The columns are
+these, in any order; others are ignored, and so is a # before the first:
 
     name          the image's file name: folders before it, letter case and its ending do not matter; without this
                   column (and without `index`) the lines go with the images in name order and there must be as many
@@ -33,7 +33,7 @@ from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import NO_IMAGE, Frame, finite_number
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm, zone_remarks
 from deepsimbad_client.recordings.names import UNITS, UNKNOWN, Finder, times_us
-from deepsimbad_client.recordings.placing import UNPLACED, Placed, placed_on
+from deepsimbad_client.recordings.placing import UNPLACED, Placement, place_on_track
 from deepsimbad_client.recordings.track import DEADBAND_M, track_of
 
 CLOCKS_APART_S = 0.5
@@ -54,7 +54,7 @@ _SPELLINGS = {
         "time",
         "stamp",
         "utime",
-        *(f"{what}_{unit}" for what in ("timestamp", "time") for unit in UNITS),
+        *(f"{word}_{unit}" for word in ("timestamp", "time") for unit in UNITS),
     ),
 }
 _COLUMN_OF = {spelling: column for column, spellings in _SPELLINGS.items() for spelling in spellings}
@@ -64,60 +64,60 @@ _WITHOUT_HEADER = {
     (1, False): ["position_m"],
     (2, True): ["name", "position_m"],
     (3, True): ["name", "x_m", "y_m"],
-}  # by how many cells a line has, and whether the first is a word
+}  # by the number of cells in a line, and whether the first is a word
 
 
 @dataclass(frozen=True)
 class _Table:
-    """What the file says, a line a row."""
+    """The content of the file, a row for each line."""
 
     path: Path
-    columns: Sequence[str | None]  # what each is; None: ignored
-    time_unit: str | None  # as the column of times is named
-    lines: Sequence[tuple[int, list[str]]]  # its number in the file, its cells
+    columns: Sequence[str | None]  # the meaning of each column; None: ignored
+    time_unit: str | None  # by the name of the column of times
+    lines: Sequence[tuple[int, list[str]]]  # (number in the file, cells)
 
-    def where(self, row: int) -> str:
-        """A row's place, for errors."""
+    def location(self, row: int) -> str:
+        """The file and line of a row, for errors."""
         return f"{self.path}, line {self.lines[row][0]}"
 
     def cells(self, column: str) -> list[str] | None:
-        """A column; None: there is no such one."""
+        """The cells of a column; None: there is no such column."""
         if column not in self.columns:
             return None
-        at = self.columns.index(column)
-        return [line[at] for _, line in self.lines]
+        index = self.columns.index(column)
+        return [line[index] for _, line in self.lines]
 
     def numbers(self, column: str) -> list[float | None]:
-        """A column of numbers, None where nothing is known. Raises SourceError (something else stands there).
+        """A column of numbers, None where a cell is empty or unknown. Raises SourceError (a cell is no number).
 
-        What is farther than `MAX_POSITION_M` stands for nothing known too.
+        Numbers beyond `MAX_POSITION_M` count as unknown too.
         """
         values: list[float | None] = []
         for row, cell in enumerate(self.cells(column) or [""] * len(self.lines)):
             value = finite_number(cell)
             if value is None and cell.lower() not in UNKNOWN:
-                raise SourceError(f"{self.where(row)}: {column} is {cell!r}, not a number such as 1234.5")
+                raise SourceError(f"{self.location(row)}: {column} is {cell!r}, not a number such as 1234.5")
             values.append(None if value is None or abs(value) > MAX_POSITION_M else value)
         return values
 
     def times_us(self) -> tuple[list[int | None], list[str]]:
-        """The times, and what is to be said of them. Raises SourceError."""
+        """The times in microseconds, and remarks on them. Raises SourceError."""
         cells = self.cells("timestamp")
         if cells is None:
             return [None] * len(self.lines), []
-        times, unit = times_us(cells, self.time_unit, [self.where(row) for row in range(len(self.lines))])
+        times, unit = times_us(cells, self.time_unit, [self.location(row) for row in range(len(self.lines))])
         differs = unit is not None and unit != self.time_unit
         return times, [f"times in {self.path.name} are taken for {unit}"] if differs else []
 
 
 def positions_file(folder: Path) -> Path | None:
-    """A folder's `positions.csv`, in whatever letter case, that of the documentation first; None: there is none."""
-    named = [path for path in folder.iterdir() if path.name.lower() == POSITIONS_FILE and path.is_file()]
-    return max(named, default=None)  # small letters come after capital ones
+    """A folder's `positions.csv`, in any letter case but small letters preferred; None: there is none."""
+    tables = [path for path in folder.iterdir() if path.name.lower() == POSITIONS_FILE and path.is_file()]
+    return max(tables, default=None)  # small letters come after capital ones
 
 
-def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int | None]) -> Placed:
-    """What `positions.csv` says of images, given in their order, with the times that their names tell.
+def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int | None]) -> Placement:
+    """Images as `positions.csv` states them; `names` are in order, and `name_times_us` the times in these names.
 
     The frames are still to be placed. Lines without names, of another number than the images, are interpolated at the
     times of the images. Raises SourceError.
@@ -139,67 +139,70 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
     ]
     if not {"name", "index"} & set(table.columns) and len(rows) != len(names):
         if "timestamp" in table.columns and "position_m" not in table.columns and None not in name_times_us:
-            return _interpolated(rows, names, name_times_us, path, deadband_m)
+            return _interpolate(rows, names, name_times_us, path, deadband_m)
         raise SourceError(f"{path} has {len(rows)} lines for {len(names)} images: add a column `name`")
     row_of, without_image = _rows_by_name(table, names)
     if not row_of:
         raise SourceError(f"{path} names none of the {len(names)} images beside it")
-    listed = [(name, time_us) for name, time_us in zip(names, name_times_us, strict=True) if name in row_of]
+    image_times = [(name, time_us) for name, time_us in zip(names, name_times_us, strict=True) if name in row_of]
     frames = [
         dataclasses.replace(
             rows[row_of[name]], name=name, timestamp_us=time_us if times[row_of[name]] is None else times[row_of[name]]
         )
-        for name, time_us in listed
+        for name, time_us in image_times
     ]
     lost = {
         f"not in {path.name}": [name for name in names if name not in row_of],
         f"in {path.name}{NO_IMAGE}": without_image,
     }
-    return Placed(
-        frames, {reason: some for reason, some in lost.items() if some}, remarks + _apart(listed, frames), deadband_m
+    return Placement(
+        frames,
+        {reason: image_names for reason, image_names in lost.items() if image_names},
+        remarks + _clock_remarks(image_times, frames),
+        deadband_m,
     )
 
 
 def _check_degrees(path: Path, latitude: NDArray[np.float64], longitude: NDArray[np.float64]) -> None:
-    """Raises SourceError: all places [n], NaN is none, are outside the earth's degrees."""
-    known = np.isfinite(latitude) & np.isfinite(longitude)
-    if known.any() and not (known & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)).any():
-        first = int(np.argmax(known))
+    """Raise SourceError if no place of [n], NaN where unknown, lies within the earth's degrees."""
+    is_known = np.isfinite(latitude) & np.isfinite(longitude)
+    if is_known.any() and not (is_known & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)).any():
+        first = int(np.argmax(is_known))
         raise SourceError(
             f"{path}: latitude {latitude[first]:g}, longitude {longitude[first]:g} is no place in degrees, which are "
             "within 90 and 180: are they changed over, or of another unit?"
         )
 
 
-def _apart(listed: Sequence[tuple[str, int | None]], frames: Sequence[Frame]) -> list[str]:
-    """Remarks on clocks: the times that the names tell differ from those in the table."""
-    apart_s = [
+def _clock_remarks(image_times: Sequence[tuple[str, int | None]], frames: Sequence[Frame]) -> list[str]:
+    """A remark where the times in the names differ from those in the table; empty where they agree."""
+    differences_s = [
         (frame.timestamp_us - time_us) / 1e6
-        for (_, time_us), frame in zip(listed, frames, strict=True)
+        for (_, time_us), frame in zip(image_times, frames, strict=True)
         if time_us is not None and frame.timestamp_us is not None
     ]
-    if not apart_s or max(map(abs, apart_s)) < CLOCKS_APART_S:
+    if not differences_s or max(map(abs, differences_s)) < CLOCKS_APART_S:
         return []
     return [
-        f"the table's times differ from those of the names by {apart_s[0]:+.3f} s at the first frame and "
-        f"{apart_s[-1]:+.3f} s at the last: the table's are taken"
+        f"the table's times differ from those of the names by {differences_s[0]:+.3f} s at the first frame and "
+        f"{differences_s[-1]:+.3f} s at the last: the table's are taken"
     ]
 
 
-def _interpolated(
+def _interpolate(
     rows: Sequence[Frame], names: Sequence[str], times_us: Sequence[int | None], path: Path, deadband_m: float
-) -> Placed:
+) -> Placement:
     columns = np.array([[row.timestamp_us, row.x_m, row.y_m] for row in rows], np.float64).T  # None becomes NaN
     time_us, x_m, y_m = columns
     track = track_of(time_us, x_m, y_m, deadband_m=deadband_m)
     if track is None:
         raise SourceError(f"{path}: fewer than two lines hold a time and a place")
     images = [(name, time_us) for name, time_us in zip(names, times_us, strict=True) if time_us is not None]
-    return placed_on(track, images, str(path), together=True)
+    return place_on_track(track, images, str(path), together=True)
 
 
 def _rows_by_name(table: _Table, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
-    """Each image's row, and what rows call images that are not there."""
+    """The row of each image by name, and the spellings in rows whose image does not exist."""
     spellings, indices = table.cells("name"), table.cells("index")
     if indices is not None and spellings is None and {"1", str(len(names))} <= set(indices) and "0" not in indices:
         raise SourceError(f"{table.path}: the index counts from 1 to {len(names)}: count from 0, or name the images")
@@ -207,23 +210,23 @@ def _rows_by_name(table: _Table, names: Sequence[str]) -> tuple[dict[str, int], 
     without_image: list[str] = []
     for row in range(len(table.lines)):
         if spellings is not None:
-            called, name = spellings[row], finder.find(spellings[row])
+            spelling, name = spellings[row], finder.find(spellings[row])
         else:
-            called = str(row) if indices is None else indices[row]
-            if not (called.isascii() and called.isdigit()):
-                raise SourceError(f"{table.where(row)}: the index {called!r} is not a whole number from 0")
-            name = names[int(called)] if int(called) < len(names) else None
+            spelling = str(row) if indices is None else indices[row]
+            if not (spelling.isascii() and spelling.isdigit()):
+                raise SourceError(f"{table.location(row)}: the index {spelling!r} is not a whole number from 0")
+            name = names[int(spelling)] if int(spelling) < len(names) else None
         if name is None:
-            without_image.append(called)
+            without_image.append(spelling)
         elif name in row_of:
-            raise SourceError(f"{table.where(row)}: {name} stands in line {table.lines[row_of[name]][0]} already")
+            raise SourceError(f"{table.location(row)}: {name} stands in line {table.lines[row_of[name]][0]} already")
         else:
             row_of[name] = row
     return row_of, without_image
 
 
 def _read(path: Path) -> _Table:
-    """Read the file. Raises SourceError."""
+    """Read the file as a table; raises SourceError."""
     lines = _lines(path)
     first = lines[0][1]
     first[0] = first[0].lstrip("# ")
@@ -232,16 +235,18 @@ def _read(path: Path) -> _Table:
     if any(columns):
         lines = lines[1:]
         if "timestamp" in columns:
-            called = first[columns.index("timestamp")].lower()
-            unit = "us" if called == "utime" else next((unit for unit in UNITS if called.endswith(f"_{unit}")), None)
+            spelling = first[columns.index("timestamp")].lower()
+            unit = (
+                "us" if spelling == "utime" else next((unit for unit in UNITS if spelling.endswith(f"_{unit}")), None)
+            )
     else:
         columns = list(_WITHOUT_HEADER.get((len(first), finite_number(first[0]) is None), []))
     if {"name", "index"} & set(columns):
         lines = [line for line in lines if any(line[1])]
-    wanted = [column for column in columns if column is not None]
-    if len(set(wanted)) != len(wanted):
+    used_columns = [column for column in columns if column is not None]
+    if len(set(used_columns)) != len(used_columns):
         raise SourceError(f"{path}: two columns mean the same: {', '.join(first)}")
-    if "position_m" not in wanted and not any(plane <= set(wanted) for plane in _PLANES):
+    if "position_m" not in used_columns and not any(plane <= set(used_columns) for plane in _PLANES):
         raise SourceError(
             f"{path}: the first line must name the columns, among them position_m, or x_m and y_m, or latitude "
             f"and longitude (and, to name the images, name); it is: {','.join(first)}"
@@ -269,8 +274,8 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
             lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if cells]
             if delimiter != ",":
                 lines = [
-                    (at, [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells])
-                    for at, cells in lines
+                    (number, [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells])
+                    for number, cells in lines
                 ]
             while lines and not any(lines[-1][1]):
                 lines.pop()

@@ -1,18 +1,18 @@
-"""SOURCE: the one way to name a recording on a command line.
+"""SOURCE, the way to name a recording on a command line, and the choice of its frames.
 
     nclt:ROOT/DATE        one date of the NCLT dataset (`nclt`)
     FOLDER                images in name order, with an optional positions.csv
     rosbag:FILE[#topic]   a ROS bag; an MCAP file needs no prefix (`bag`)
     FILE.mp4 and others   a video (`video`)
     FILE.npy, FILE.csv    ready encodings [n, d], one row for each frame, in travel order
-    nordland:ROOT/summer  and other sets that others measure on (`benchmarks`)
+    nordland:ROOT/summer  and other public benchmark sets (`benchmarks`)
 
 Each may end in #START:STOP or #START:STOP:STEP, Python's slice of its frames, which keep their places and positions.
 
 In a folder, name order counts digits as numbers (2.png before 10.png); names padded with zeros sort as
 usual. Folders inside and files whose name starts with a dot are not looked at.
 
-And which of its frames are taken, in which order: every few, from the other end, one turn, one drive.
+Frames are then chosen: every few, from the other end, of one turn; and those of several drives are refused.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from deepsimbad_client.errors import InvalidArgumentError, SourceError
 from deepsimbad_client.recordings import TURNS, Frame, Recording, finite_number
 from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA, read_bag
-from deepsimbad_client.recordings.benchmarks import open_benchmark, recognised
+from deepsimbad_client.recordings.benchmarks import open_benchmark, open_recognised
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.names import counted_anew, dates_in
 from deepsimbad_client.recordings.nclt import FRONT_CAMERA, NcltRecording, ground_truth_files, read_nclt
@@ -43,7 +43,7 @@ NCLT_PREFIX = "nclt:"
 MOST_OFFSET_S = 1e10  # three centuries
 ENCODING_SUFFIXES = frozenset({".npy", ".csv"})
 RECORDING_SUFFIXES = ENCODING_SUFFIXES | VIDEO_SUFFIXES | BAG_SUFFIXES
-"""Of files that hold many frames."""
+"""The suffixes of files that hold many frames."""
 
 _SLICE = re.compile(r"\s*([+-]?\d+)?\s*:\s*([+-]?\d+)?\s*(?::\s*([+-]?\d+)?\s*)?")
 
@@ -61,23 +61,23 @@ def open_source(
     reverse: bool = False,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Recording:
-    """Open a recording, see the top of this module.
+    """Open a recording.
 
     Args:
-        source: SOURCE.
-        spacing_m: Between frames of unsaid places.
+        source: SOURCE, see the top of this module.
+        spacing_m: Metres between frames where the recording states no positions.
         camera: NCLT's, 0..5.
         undistortion: NCLT's table, or the folder of them.
         rotate: Degrees clockwise, 0, 90, 180 or 270, by which images are turned; None: NCLT's upright, others not.
-        time_offset_s: Added to the images' times before a track is asked where they were taken.
+        time_offset_s: Added to the images' times before they are looked up on a track.
         every_s: Take one frame every so many seconds.
         every_m: Take one frame every so many metres.
         reverse: Take the frames in the other order.
-        on_progress: Told the share that is read, where opening takes long.
+        on_progress: Called with the share that is read, where opening takes long.
 
     Raises:
         SourceError: There is no such recording, it makes no sense, or positions fall along the drive.
-        InvalidArgumentError: What was asked does not go with a recording of this kind.
+        InvalidArgumentError: An option does not go with a recording of this kind.
     """
     if not (math.isfinite(spacing_m) and spacing_m > 0):
         raise SourceError(f"a spacing of {spacing_m} m: frames must be more than 0 m apart")
@@ -86,9 +86,9 @@ def open_source(
     if rotate is not None and rotate not in TURNS:
         raise SourceError(f"images cannot be turned by {rotate} degrees: give 0, 90, 180 or 270")
     place, part = split_slice(source)
-    how = _How(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
-    recording = _open_whole(place, how)
-    _check_options(recording, how)
+    options = _Options(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
+    recording = _open_whole(place, options)
+    _check_options(recording, options)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:
         recording = turned_back(recording)
@@ -104,8 +104,8 @@ def open_source(
 
 
 @dataclass(frozen=True)
-class _How:
-    """As `open_source` was asked."""
+class _Options:
+    """The options of `open_source` that readers take."""
 
     spacing_m: float
     camera: int
@@ -115,14 +115,14 @@ class _How:
     on_progress: Callable[[float], None]
 
 
-def _check_options(recording: Recording, how: _How) -> None:
-    """Raises InvalidArgumentError: what was asked would change nothing in a recording of this kind."""
+def _check_options(recording: Recording, options: _Options) -> None:
+    """Raise InvalidArgumentError for an option that would change nothing in a recording of this kind."""
     is_nclt, is_set = isinstance(recording, NcltRecording), recording.tolerance_m is not None
     has_images = recording.encodings is None
     for option, is_asked, fits in (
-        ("--undistortion", how.undistortion is not None, is_nclt),
-        ("--rotate", bool(how.rotate), has_images),
-        ("--time-offset-s", how.time_offset_us != 0, has_images and not is_nclt and not is_set),
+        ("--undistortion", options.undistortion is not None, is_nclt),
+        ("--rotate", bool(options.rotate), has_images),
+        ("--time-offset-s", options.time_offset_us != 0, has_images and not is_nclt and not is_set),
     ):
         if is_asked and not fits:
             raise InvalidArgumentError(f"{option} does not go with a recording such as {recording.name}: leave it out")
@@ -131,7 +131,7 @@ def _check_options(recording: Recording, how: _How) -> None:
 def split_slice(source: str) -> tuple[str, slice | None]:
     """Split SOURCE into the recording and the slice of its frames; a `#` in a file's own name does no harm.
 
-    Raises SourceError (what follows the `#` is neither a slice nor a file's).
+    Raises SourceError (the text behind the `#` is neither a slice nor part of a file's name).
     """
     place, mark, ending = source.rpartition("#")
     if not mark or Path(source.removeprefix(NCLT_PREFIX)).expanduser().exists():
@@ -144,20 +144,24 @@ def split_slice(source: str) -> tuple[str, slice | None]:
     raise SourceError(f"{source}: a slice is #START:STOP or #START:STOP:STEP in whole frames, not #{ending}")
 
 
-def _open_whole(place: str, how: _How) -> Recording:
+def _open_whole(place: str, options: _Options) -> Recording:
     if place.startswith(NCLT_PREFIX):
         drive = Path(place.removeprefix(NCLT_PREFIX)).expanduser()
         if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
-        return read_nclt(drive.parent, drive.name, camera=how.camera, undistortion=how.undistortion, rotate=how.rotate)
-    if (benchmark := open_benchmark(place, how.spacing_m, how.rotate or 0)) is not None:
+        return read_nclt(
+            drive.parent, drive.name, camera=options.camera, undistortion=options.undistortion, rotate=options.rotate
+        )
+    if (benchmark := open_benchmark(place, options.spacing_m, options.rotate or 0)) is not None:
         return benchmark
     bag, _, topics = place.partition("#")
     if _is_bag(bag):
         bag_path = Path(bag.removeprefix(BAG_PREFIX)).expanduser()
         if not bag_path.exists():
             raise SourceError(f"no bag at {bag_path}")
-        return read_bag(bag_path, topics, how.spacing_m, how.rotate or 0, how.time_offset_us, how.on_progress)
+        return read_bag(
+            bag_path, topics, options.spacing_m, options.rotate or 0, options.time_offset_us, options.on_progress
+        )
     path = Path(place).expanduser()
     if not place or not path.exists():
         raise SourceError(
@@ -165,12 +169,14 @@ def _open_whole(place: str, how: _How) -> Recording:
             "encodings in a .npy or .csv"
         )
     if path.is_dir():
-        known = _nclt_camera(path, how) or recognised(path, how.spacing_m, how.rotate or 0)
-        return known or read_folder(path, how.spacing_m, how.rotate, how.time_offset_us, how.on_progress)
+        recording = _nclt_camera(path, options) or open_recognised(path, options.spacing_m, options.rotate or 0)
+        return recording or read_folder(
+            path, options.spacing_m, options.rotate, options.time_offset_us, options.on_progress
+        )
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return read_video(path, how.spacing_m, how.rotate or 0, how.time_offset_us, how.on_progress)
+        return read_video(path, options.spacing_m, options.rotate or 0, options.time_offset_us, options.on_progress)
     if path.suffix.lower() in ENCODING_SUFFIXES:
-        return _read_encodings(path, how.spacing_m)
+        return _read_encodings(path, options.spacing_m)
     raise SourceError(
         f"{path}: expected a video ({', '.join(sorted(VIDEO_SUFFIXES))}) or ready encodings [n, d] in a .npy or .csv; "
         "images are named by their folder"
@@ -182,10 +188,10 @@ def _is_bag(place: str) -> bool:
     return place.startswith(BAG_PREFIX) or path.suffix.lower() in BAG_SUFFIXES or (path / METADATA).is_file()
 
 
-def _nclt_camera(folder: Path, how: _How) -> Recording | None:
+def _nclt_camera(folder: Path, options: _Options) -> Recording | None:
     """The recording of a camera's folder in NCLT's layout (ROOT/DATE/lb3/Cam5); None: it is none, or has no poses.
 
-    Raises SourceError (what is there cannot be read).
+    Raises SourceError (it cannot be read).
     """
     drive = folder.resolve().parent.parent
     camera = re.fullmatch(r"Cam([0-5]).*", folder.resolve().name)
@@ -194,11 +200,11 @@ def _nclt_camera(folder: Path, how: _How) -> Recording | None:
     root = drive.parent.parent if drive.parent.name == "images" else drive.parent
     if not any(path.is_file() for path in ground_truth_files(root, drive.name)):
         return None
-    options: dict[str, Any] = {"undistortion": how.undistortion, "rotate": how.rotate, "folder": folder}
-    recording = read_nclt(root, drive.name, camera=int(camera[1]), **options)
-    turn = "upright" if how.rotate is None else f"turned by {how.rotate} degrees"
-    said = f"NCLT's layout: read as {NCLT_PREFIX}{root / drive.name}, camera {camera[1]}, {turn}"
-    return dataclasses.replace(recording, remarks=[said, *recording.remarks])
+    arguments: dict[str, Any] = {"undistortion": options.undistortion, "rotate": options.rotate, "folder": folder}
+    recording = read_nclt(root, drive.name, camera=int(camera[1]), **arguments)
+    turn = "upright" if options.rotate is None else f"turned by {options.rotate} degrees"
+    remark = f"NCLT's layout: read as {NCLT_PREFIX}{root / drive.name}, camera {camera[1]}, {turn}"
+    return dataclasses.replace(recording, remarks=[remark, *recording.remarks])
 
 
 def _read_encodings(path: Path, spacing_m: float) -> Recording:
@@ -240,7 +246,7 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
 
 
 def _read_csv(path: Path) -> NDArray[np.generic]:
-    """Line by line: what is wrong is then said with its line number."""
+    """Read a csv line by line, so that errors name the line."""
     rows: list[NDArray[np.float64]] = []
     try:
         lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
@@ -266,12 +272,12 @@ def _read_csv(path: Path) -> NDArray[np.generic]:
 
 EARLY_SHARE = 0.02  # of a step, by which a frame may come before it is due
 FEWEST_OF_A_TURN, NEAR_START_M = 10, 1.0
-FEWEST_OF_A_KIND = 3
+FEWEST_OF_A_KIND = 3  # frames whose names are of one kind
 LONGEST_PAUSE_S, SAME_PLACE_M = 3600.0, 10.0  # of one drive, unless the robot goes on where it stood
 
 
 def thinned(recording: Recording, every_s: float | None, every_m: float | None) -> Recording:
-    """The first frame of every so many seconds or metres, counted anew; with neither all of them.
+    """The first frame of every so many seconds or metres, with indices from 0; with neither, the recording as it is.
 
     Raises SourceError (both are given, one is not above 0, or the frames have no times).
     """
@@ -280,12 +286,12 @@ def thinned(recording: Recording, every_s: float | None, every_m: float | None) 
         return recording
     if (every_s is not None and every_m is not None) or not (math.isfinite(every) and every > 0):
         raise SourceError("frames are taken every so many seconds (--every-s) or metres (--every-m), above 0")
-    at = [frame.position_m if every_m else (frame.timestamp_us or 0) / 1e6 for frame in recording.frames]
+    progress = [frame.position_m if every_m else (frame.timestamp_us or 0) / 1e6 for frame in recording.frames]
     if every_s is not None and any(frame.timestamp_us is None for frame in recording.frames):
         raise SourceError(
             f"{recording.name} does not say when its frames were taken: --every-m goes by their positions"
         )
-    steps = np.floor((np.array(at) - at[0]) / every + EARLY_SHARE)  # a clock that trembles skips no frame
+    steps = np.floor((np.array(progress) - progress[0]) / every + EARLY_SHARE)  # so that a jittery clock skips no frame
     rows = np.flatnonzero(np.diff(steps, prepend=np.nan) != 0)
     frames = tuple(dataclasses.replace(recording.frames[row], index=index) for index, row in enumerate(rows.tolist()))
     encodings = None if recording.encodings is None else recording.encodings[rows]
@@ -293,9 +299,9 @@ def thinned(recording: Recording, every_s: float | None, every_m: float | None) 
 
 
 def one_turn(recording: Recording) -> Recording:
-    """Of a drive along a closed route: without what comes after it reached its start again.
+    """A drive along a closed route without the frames after it reached its start again.
 
-    Told by x, y: near the first frame within two usual steps, in its direction. What is not known stays.
+    It does so at x, y within two median steps of the first frame, in its direction. A drive without x, y stays.
     """
     places = [(frame.x_m, frame.y_m) for frame in recording.frames if frame.x_m is not None and frame.y_m is not None]
     if len(places) < max(len(recording.frames), FEWEST_OF_A_TURN):
@@ -304,25 +310,25 @@ def one_turn(recording: Recording) -> Recording:
     steps = np.hypot(np.diff(x_m), np.diff(y_m))
     near_m = max(NEAR_START_M, 2 * float(np.median(steps[steps > 0]))) if (steps > 0).any() else NEAR_START_M
     away_m = np.hypot(x_m - x_m[0], y_m - y_m[0])
-    left = int(np.argmax(away_m > 3 * near_m))
-    ahead_x, ahead_y = x_m[left] - x_m[0], y_m[left] - y_m[0]
+    left_row = int(np.argmax(away_m > 3 * near_m))
+    ahead_x, ahead_y = x_m[left_row] - x_m[0], y_m[left_row] - y_m[0]
     onwards = np.gradient(x_m) * ahead_x + np.gradient(y_m) * ahead_y >= 0
-    back = np.flatnonzero((np.arange(len(x_m)) > left) & (away_m <= near_m) & onwards)
-    if not left or not len(back):
+    back = np.flatnonzero((np.arange(len(x_m)) > left_row) & (away_m <= near_m) & onwards)
+    if not left_row or not len(back):
         return recording
     visit = back[: int(np.argmax(np.diff(back, append=len(x_m) + 2) > 1)) + 1]
     end = int(visit[np.argmin(away_m[visit])]) + 1
     if end == len(recording.frames):
         return recording
-    said = (
+    remark = (
         f"the start is reached again at {recording.frames[end - 1].name}: {len(recording.frames) - end} frames of a "
         "second turn are not used"
     )
-    return dataclasses.replace(recording.sliced(slice(0, end)), remarks=[*recording.remarks, said])
+    return dataclasses.replace(recording.sliced(slice(0, end)), remarks=[*recording.remarks, remark])
 
 
 def turned_back(recording: Recording) -> Recording:
-    """The frames in the other order: positions that fell rise now; those that rose count from the other end."""
+    """The frames in reverse order: positions that fell now rise; those that rose count from the other end."""
     first_m, last_m = recording.frames[0].position_m, recording.frames[-1].position_m
     frames = tuple(
         dataclasses.replace(
@@ -345,31 +351,31 @@ def _check_names(recording: Recording) -> None:
         return
     names = [frame.name for frame in frames]
     kinds = [re.sub(r"[0-9]+(?:[.,][0-9]+)*", "0", name) for name in names]
-    changes = np.flatnonzero([before != kind for before, kind in pairwise(kinds)]) + 1
+    changes = np.flatnonzero([left != right for left, right in pairwise(kinds)]) + 1
     if 2 * len(changes) >= len(frames) and min(Counter(kinds).values()) >= FEWEST_OF_A_KIND:
-        after = frames[int(changes[0])]
+        row = int(changes[0])
         raise SourceError(
-            f"{recording.name}: {frames[int(changes[0]) - 1].name} and {after.name} are names of several kinds by "
+            f"{recording.name}: {frames[row - 1].name} and {frames[row].name} are names of several kinds by "
             "turns: are these several drives or cameras? Move each into a folder of its own, or say in a positions.csv "
             "where each image was taken"
         )
-    if frames[0].timestamp_us is not None:  # which tell by themselves
+    if frames[0].timestamp_us is not None:  # times show several drives by themselves
         return
     if len(set(kinds)) == 1 and dates_in(names) is None:
         changes = np.array(counted_anew(names), np.intp)
     ends = [0, *changes.tolist(), len(frames)]
     if len(changes) and min(np.diff(ends)) >= FEWEST_OF_A_KIND and len(set(kinds)) in {1, len(changes) + 1}:
-        before, after = frames[ends[1] - 1], frames[ends[1]]
-        what = "count anew" if len(set(kinds)) == 1 else "are names of two kinds"
+        last, first = frames[ends[1] - 1], frames[ends[1]]
+        trouble = "count anew" if len(set(kinds)) == 1 else "are names of two kinds"
         raise SourceError(
-            f"{recording.name}: {before.name} and {after.name} {what}: are these several drives? Name "
-            f"one of them by a slice (#:{after.index} or #{after.index}:), move them apart, or say in a positions.csv "
+            f"{recording.name}: {last.name} and {first.name} {trouble}: are these several drives? Name "
+            f"one of them by a slice (#:{first.index} or #{first.index}:), move them apart, or say in a positions.csv "
             "where each image was taken"
         )
 
 
 def check_one_drive(recording: Recording) -> None:
-    """Refuse what was recorded in several goes, elsewhere each: the way between was not recorded, nor is its length."""
+    """Raise SourceError for a recording of several drives at several places, the ways between which are unknown."""
     _check_names(recording)
     frames = [frame for frame in recording.frames if frame.timestamp_us is not None]
     times = [frame.timestamp_us / 1e6 for frame in frames if frame.timestamp_us is not None]
@@ -381,12 +387,12 @@ def check_one_drive(recording: Recording) -> None:
     longest = int(np.argmax(pauses_s))
     if pauses_s[longest] < max(LONGEST_PAUSE_S, 100 * float(np.median(pauses_s))):
         return
-    before, after = frames[longest : longest + 2]
-    if None not in (before.x_m, before.y_m, after.x_m, after.y_m):
-        apart_m = math.dist((before.x_m or 0, before.y_m or 0), (after.x_m or 0, after.y_m or 0))
+    last, first = frames[longest : longest + 2]
+    if None not in (last.x_m, last.y_m, first.x_m, first.y_m):
+        apart_m = math.dist((last.x_m or 0, last.y_m or 0), (first.x_m or 0, first.y_m or 0))
         if apart_m <= SAME_PLACE_M:
             return
     raise SourceError(
-        f"{recording.name}: between {before.name} and {after.name} pass {pauses_s[longest] / 3600:.1f} hours: these "
-        f"are several drives. Name one of them by a slice (#:{after.index} or #{after.index}:), or move them apart"
+        f"{recording.name}: between {last.name} and {first.name} pass {pauses_s[longest] / 3600:.1f} hours: these "
+        f"are several drives. Name one of them by a slice (#:{first.index} or #{first.index}:), or move them apart"
     )

@@ -130,6 +130,6 @@ def test_a_jump_ahead_keeps_few_frames_at_any_time(video, monkeypatch):
 
     monkeypatch.setattr(videos, "N_KEPT", 4)
     recording = open_source(str(video))
-    monkeypatch.setattr(recording.decoder, "_kept", Counted())
+    monkeypatch.setattr(recording.decoder, "_images", Counted())
     assert grey(recording, recording.frames[29]) == pytest.approx(145, abs=2)
     assert Counted.most == 5
