@@ -4,7 +4,7 @@ import os
 import sys
 from importlib.util import find_spec
 
-NEEDED = (
+PACKAGES = (
     "click",
     "cv2",
     "fastapi",
@@ -22,7 +22,7 @@ NEEDED = (
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    missing = [name for name in NEEDED if find_spec(name) is None]
+    missing = [name for name in PACKAGES if find_spec(name) is None]
     if missing:
         sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[service]'\n")
         sys.exit(1)

@@ -35,13 +35,13 @@ _MOST_NAMED, _LONGEST_WORD = 20, 100
 
 
 def nearest_of(word: str, names: Iterable[str]) -> str:
-    """What to say behind an unknown word: the nearest that there is, and all, as far as anybody would read."""
-    known = list(names)
-    if not known:
+    """The end of a message about an unknown word: the nearest of the names, and the first of all of them."""
+    choices = list(names)
+    if not choices:
         return ": there is none yet"
-    near = get_close_matches(word.lower(), known, 1, 0.5) if len(word) <= _LONGEST_WORD else []
-    listed = ", ".join(known[:_MOST_NAMED]) + (", ..." if len(known) > _MOST_NAMED else "")
-    return f": did you mean {near[0]}? There is {listed}" if near else f": there is {listed}"
+    nearest = get_close_matches(word.lower(), choices, 1, 0.5) if len(word) <= _LONGEST_WORD else []
+    listing = ", ".join(choices[:_MOST_NAMED]) + (", ..." if len(choices) > _MOST_NAMED else "")
+    return f": did you mean {nearest[0]}? There is {listing}" if nearest else f": there is {listing}"
 
 
 class InvalidInputError(DeepSimbadError, code="invalid_input"):
@@ -220,14 +220,15 @@ class WeightsDifferError(ConflictError, code="weights_differ"):
     """A view, frame or traverse encoded by other weights than the map or traverse it should join."""
 
     @classmethod
-    def check(cls, what: str, known: str | None, given_to: str, given: str | None) -> None:
-        """Refuse to bring together encodings of two networks, by the SHA-256 of their weights; None is believed."""
-        if known is not None and given is not None and known != given:
+    def check(cls, base: str, base_sha256: str | None, addition: str, addition_sha256: str | None) -> None:
+        """Refuse an addition whose weights, by their SHA-256, are not those of the base; None is taken for equal."""
+        if base_sha256 is not None and addition_sha256 is not None and base_sha256 != addition_sha256:
             raise cls(
-                f"{given_to} comes from other weights ({given[:12]}...) than {what} ({known[:12]}...): their encodings "
-                "cannot be compared. Bring the old weights back, or upload and map anew",
-                known_weights_sha256=known,
-                given_weights_sha256=given,
+                f"{addition} comes from other weights ({addition_sha256[:12]}...) than {base} "
+                f"({base_sha256[:12]}...): their encodings cannot be compared. Bring the old weights back, or upload "
+                "and map anew",
+                known_weights_sha256=base_sha256,
+                given_weights_sha256=addition_sha256,
             )
 
 

@@ -30,7 +30,7 @@ from deepsimbad.jobs.child import JobPriority
 MEBIBYTE = 1024 * 1024
 CONFIG_VARIABLE = "DEEPSIMBAD_CONFIG"
 CONFIG_FILE = Path("deepsimbad.toml")
-# The client's, the tests'.
+# Of the client and of the tests
 _OTHER_VARIABLES = {CONFIG_VARIABLE, "DEEPSIMBAD_URL", "DEEPSIMBAD_API_KEY", "DEEPSIMBAD_REAL_DATA"}
 _ORIGIN = re.compile(r"\*|[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 
@@ -204,12 +204,12 @@ class TracedSettings(NamedTuple):
     file: Path | None
 
 
-def trace_settings(config: Path | None = None, **given: object) -> TracedSettings:
-    """Settings from what is given, the environment, the settings file and the defaults, in this order.
+def trace_settings(config: Path | None = None, **flags: object) -> TracedSettings:
+    """Settings from the flags, the environment, the settings file and the defaults, in this order.
 
     Args:
         config: The settings file; None: the one that $DEEPSIMBAD_CONFIG names, else ./deepsimbad.toml if it is there.
-        **given: Settings by name, as flags give them; those that are None count as not given.
+        **flags: Settings by name; those that are None count as not given.
 
     Raises:
         SettingsError: The file cannot be read, a name is unknown or a value cannot be used.
@@ -222,10 +222,9 @@ def trace_settings(config: Path | None = None, **given: object) -> TracedSetting
         "default": "the defaults",
     }
 
-    def unusable(name: str, origin: str, why: str) -> SettingsError:
+    def unusable(name: str, origin: str, reason: str) -> SettingsError:
         variable = f" ({variable_of(name)})" if origin == "environment" else ""
-        what = f"setting {name!r} of {places[origin]}{variable} cannot be used: {why}"
-        return SettingsError(what, setting=name)
+        return SettingsError(f"setting {name!r} of {places[origin]}{variable} cannot be used: {reason}", setting=name)
 
     try:
         environment = EnvSettingsSource(Settings)()
@@ -233,30 +232,30 @@ def trace_settings(config: Path | None = None, **given: object) -> TracedSetting
         name = next((name for name in Settings.model_fields if f'"{name}"' in str(error)), "?")
         raise unusable(name, "environment", "not a JSON list") from error
     sources: dict[str, dict[str, Any]] = {  # strongest first
-        "flag": {name: value for name, value in given.items() if value is not None},
+        "flag": {name: value for name, value in flags.items() if value is not None},
         "environment": environment,
         "file": {} if file is None else _read(file),
         "default": {name: field.default for name, field in Settings.model_fields.items()},
     }
     for origin, values in sources.items():
         for name in sorted(values.keys() - Settings.model_fields):
-            near = get_close_matches(name.lower(), Settings.model_fields, 1)
-            meant = f": did you mean {near[0]!r}?" if near else "; `deepsimbad settings` lists those there are"
-            raise SettingsError(f"there is no setting {name!r}, which stands in {places[origin]}{meant}", setting=name)
+            nearest = get_close_matches(name.lower(), Settings.model_fields, 1)
+            hint = f": did you mean {nearest[0]!r}?" if nearest else "; `deepsimbad settings` lists those there are"
+            raise SettingsError(f"there is no setting {name!r}, which stands in {places[origin]}{hint}", setting=name)
     origins = {name: next(origin for origin in sources if name in sources[origin]) for name in Settings.model_fields}
     try:
         settings = Settings(**{name: sources[origin][name] for name, origin in origins.items() if origin != "default"})
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        name = str(first["loc"][0]) if first["loc"] else "?"
-        raise unusable(name, origins.get(name, "default"), first["msg"]) from error
+        finding = error.errors(include_url=False, include_input=False)[0]
+        name = str(finding["loc"][0]) if finding["loc"] else "?"
+        raise unusable(name, origins.get(name, "default"), finding["msg"]) from error
     return TracedSettings(settings, origins, file)
 
 
 def unknown_variables() -> list[str]:
     """The variables of the environment that look like settings and are none: perhaps mistyped."""
-    known = {variable_of(name) for name in Settings.model_fields} | _OTHER_VARIABLES
-    return sorted(name for name in os.environ if name.startswith("DEEPSIMBAD_") and name not in known)
+    variables = {variable_of(name) for name in Settings.model_fields} | _OTHER_VARIABLES
+    return sorted(name for name in os.environ if name.startswith("DEEPSIMBAD_") and name not in variables)
 
 
 def variable_of(name: str) -> str:

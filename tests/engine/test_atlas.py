@@ -32,6 +32,6 @@ def test_two_processes_that_share_domains_out_answer_as_one_that_has_all(catalog
     assert list(whole.probabilities) == list(shared.probabilities)
     assert np.allclose(list(whole.probabilities.values()), list(shared.probabilities.values()), atol=1e-6)
     assert (whole.n_others, list(whole.left_out)) == (shared.n_others, list(shared.left_out)) == (4, ["unmapped"])
-    assert abs(whole.elsewhere - shared.elsewhere) < 1e-6
+    assert abs(whole.elsewhere_probability - shared.elsewhere_probability) < 1e-6
     for name, localization in whole.likeliest.items():
         assert localization.belief.mode_m == shared.likeliest[name].belief.mode_m

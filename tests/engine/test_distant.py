@@ -6,7 +6,7 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from deepsimbad.engine.distant import EncodedElsewhere, NetworkFacts, by_encoder, encoded
+from deepsimbad.engine.distant import DistantEvaluator, NetworkFacts, by_encoder, encoded
 from deepsimbad.engine.worker import EncodedImage, EvaluatorPool, InferenceWorker, encode_images
 from deepsimbad.errors import UnavailableError
 from deepsimbad.evaluators.base import Lesson
@@ -90,7 +90,7 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, wor
 )
 def test_who_has_no_network_asks_nobody(beside, raw):
     evaluator = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
-    assert not isinstance(evaluator, EncodedElsewhere)
+    assert not isinstance(evaluator, DistantEvaluator)
 
 
 def test_an_encoder_that_is_away_is_told_and_asked_again(beside):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from deepsimbad.engine import maps as maps_module
-from deepsimbad.engine.maps import Maps, Retention, beyond_keeping
+from deepsimbad.engine.maps import Maps, Retention, surplus_versions
 from deepsimbad.engine.session import SessionConfig
 from deepsimbad.errors import DamagedMapError, MapInUseError, NoActiveMapError, RetiredMapError, UnavailableError
 from deepsimbad.store import catalog_maps
@@ -128,7 +128,7 @@ def beyond(history: str, keep_maps: int) -> list[int]:
         KeptMap("d", version, states.get(word, MapState.RETIRED), f"200{word}" if word in "123456789" else None)
         for version, word in enumerate(history, 1)
     ]
-    return sorted(version.version for version in beyond_keeping(versions, keep_maps))
+    return sorted(version.version for version in surplus_versions(versions, keep_maps))
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_the_one_that_served_last_is_the_newest_though_the_clock_was_set_back(ma
     with closing(sqlite3.connect(catalog_path(mapped.data_dir))) as db, db:  # as noted by a clock that ran ahead
         db.execute("UPDATE map SET retired_at = '2999-01-01T00:00:00.000Z' WHERE version = 1")
     add_map(mapped)
-    assert [version.version for version in beyond_keeping(mapped.kept_maps(), 1)] == [1], "version 2 served last"
+    assert [version.version for version in surplus_versions(mapped.kept_maps(), 1)] == [1], "version 2 served last"
 
 
 def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:

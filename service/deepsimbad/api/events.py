@@ -92,5 +92,5 @@ async def get_session_events(
 )
 async def get_view(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> Response:
     """What the robot saw last, as a small picture; held in memory alone, for people who look on."""
-    content = await run_sync(running.pictures.seen, session.session_id)
+    content = await run_sync(running.pictures.view, session.session_id)
     return Response(status_code=204) if content is None else Response(content, media_type="image/jpeg")

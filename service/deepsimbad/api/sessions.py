@@ -314,7 +314,7 @@ async def post_observation(
         running.metrics.observed(error.code)
         raise
     if media_type in MEDIA_TYPES and await _keeps_pictures(running, view.snapshot.domain):
-        running.pictures.saw(session_id, body)
+        running.pictures.hold_view(session_id, body)
     answer, body = await running.render_json(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"

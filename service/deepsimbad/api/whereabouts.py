@@ -161,13 +161,15 @@ def render_whereabouts(
             places.append({**place, "domain": name, "mass": probability * place["mass"]})
     is_informative = bool(domains) and domains[0]["informative"]
     warnings = [*remarks] + ([] if is_informative else ["the view told nothing of the place"])
-    if posterior.elsewhere > WARNING_PROBABILITY:
-        warnings.append(f"the robot is probably on none of these routes: elsewhere is {posterior.elsewhere:.2f}")
+    if posterior.elsewhere_probability > WARNING_PROBABILITY:
+        warnings.append(
+            f"the robot is probably on none of these routes: elsewhere is {posterior.elsewhere_probability:.2f}"
+        )
     left_out = list(posterior.left_out.items())
     return {
         "domains": domains,
-        "others": {"n_domains": posterior.n_others, "probability": posterior.of_others},
-        "elsewhere": posterior.elsewhere,
+        "others": {"n_domains": posterior.n_others, "probability": posterior.others_probability},
+        "elsewhere": posterior.elsewhere_probability,
         "top": nlargest(n_top or DEFAULT_SHORTLIST, places, key=lambda place: place["mass"]),
         "informative": is_informative,
         "warnings": warnings,

@@ -1,6 +1,6 @@
 """One view on many domains: which of them can answer, how probable each is, and where on the likeliest few it is.
 
-What a process has asked of its own domains is a `Part`; `whereabouts` makes the answer of one or of several.
+The answer of one process for its own domains is a `Part`; `whereabouts` puts one or several together.
 """
 
 import logging
@@ -32,30 +32,30 @@ MOST_IN_FULL = 100
 
 @dataclass(frozen=True)
 class Part:
-    """What a view is to some domains."""
+    """A view's evidence for some domains, and where on the likeliest of them it is."""
 
     log_evidences: Mapping[str, float]  # by domain, against elsewhere
-    # On the few with the most; of another process what it would answer, for maps stay where they are
+    # By domain, of the few with the most evidence; from another process its rendered answer, for maps stay there
     likeliest: Mapping[str, Localization | Mapping[str, Any]]
-    left_out: Mapping[str, DeepSimbadError]  # why others could not answer
+    left_out: Mapping[str, DeepSimbadError]  # by domain, why it could not answer
 
 
 @dataclass(frozen=True)
 class Whereabouts:
     """The posterior over domains and places."""
 
-    probabilities: Mapping[str, float]  # of the few that are told in full, the likeliest first
-    log_evidences: Mapping[str, float]  # theirs
-    likeliest: Mapping[str, Localization | Mapping[str, Any]]  # and where on them, if the robot is there
-    n_others: int
-    of_others: float  # their probability, all together
-    elsewhere: float  # that it is none of them
+    probabilities: Mapping[str, float]  # by domain, of the few that are answered in full, the likeliest first
+    log_evidences: Mapping[str, float]  # of the same domains
+    likeliest: Mapping[str, Localization | Mapping[str, Any]]  # where on each of them, if the robot is on it
+    n_others: int  # domains that answered and are not among these few
+    others_probability: float  # of all of them together
+    elsewhere_probability: float  # that the robot is on none of the domains
     left_out: Mapping[str, DeepSimbadError]
 
 
 @dataclass(frozen=True)
 class MapHead:
-    """What a view is made for a map by, in the place of a map that stays where it is; see `Map`."""
+    """What is needed of a map to prepare a view for it, in the place of a map in another process; see `Map`."""
 
     domain: str
     version: int
@@ -67,7 +67,7 @@ class MapHead:
 
     @classmethod
     def of(cls, map_: Map) -> Self:
-        """Of a map; works out the digest at first need."""
+        """The head of a map; computes its landmark model's digest at first need."""
         levels = with_levels({}, levels_in(map_.landmark_model))
         return cls(map_.domain, map_.version, levels, map_.cameras, map_.landmark_model_digest)
 
@@ -76,28 +76,28 @@ class Owners(Protocol):
     """Other processes that have the domains, asked as an `Atlas` is; a domain whose owners are away is left out."""
 
     async def gather(self, names: Sequence[str], is_all: bool) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
-        """As `Atlas.gather`; of the maps there is a `MapHead`."""
+        """As `Atlas.gather`, with a `MapHead` in the place of each map."""
 
     async def ask(
         self, domains: Sequence[MappedDomain], view: View, n_in_full: int, n_shortlist: int | None
     ) -> list[Part]:
-        """As `Atlas.ask`, of a view that is encoded."""
+        """As `Atlas.ask`, for a view that is encoded already."""
 
 
 def whereabouts(parts: Sequence[Part], n_in_full: int) -> Whereabouts:
     """Put parts together that have asked different domains, each for at least `n_in_full` of its likeliest."""
     log_evidences = {name: value for part in parts for name, value in part.log_evidences.items()}
-    probabilities, elsewhere = atlas.posterior(log_evidences)
+    probabilities, elsewhere_probability = atlas.posterior(log_evidences)
     names = _likeliest(log_evidences, n_in_full)
-    localizations = {name: each for part in parts for name, each in part.likeliest.items()}
+    localizations = {name: localization for part in parts for name, localization in part.likeliest.items()}
     left_out = {name: error for part in parts for name, error in part.left_out.items()}
     return Whereabouts(
         {name: probabilities[name] for name in names},
         {name: log_evidences[name] for name in names},
         {name: localizations[name] for name in names},
         len(log_evidences) - len(names),
-        max(0.0, 1.0 - elsewhere - sum(probabilities[name] for name in names)),
-        elsewhere,
+        max(0.0, 1.0 - elsewhere_probability - sum(probabilities[name] for name in names)),
+        elsewhere_probability,
         dict(sorted(left_out.items())),
     )
 
@@ -109,101 +109,103 @@ class Atlas:
         self._maps = maps
         self._clock = clock
         self._lock = threading.Lock()
-        self._asked: atlas.Atlas | None = None  # the maps that were asked last, as compiled code takes them
+        self._last_atlas: atlas.Atlas | None = None  # of the maps that were asked last
 
     def gather(self, names: Sequence[str], is_all: bool) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
         """The domains and their active maps, and why others have none; reads files for some seconds at most.
 
         Args:
-            names: Of domains.
-            is_all: Whether nobody named them: then maps are read as far as there is room, and a domain that was
-                deleted meanwhile is none.
+            names: Names of domains.
+            is_all: Whether these are all domains, and nobody named them: then maps are read as far as there is room,
+                and a domain that was deleted meanwhile is passed over.
 
         Raises:
             UnknownDomainError: There is no such domain.
         """
         self._maps.confirm()
-        until, there, left_out = self._clock() + LOADING_S, list[MappedDomain](), dict[str, DeepSimbadError]()
-        cold = []
+        deadline_s = self._clock() + LOADING_S
+        mapped_domains, left_out, cold_names = list[MappedDomain](), dict[str, DeepSimbadError](), list[str]()
         for name in names:
-            mapped = self._maps.peek(name)
-            if mapped is None:
-                cold.append(name)
+            mapped_domain = self._maps.peek(name)
+            if mapped_domain is None:
+                cold_names.append(name)
             else:
-                there.append(mapped)
-        for name in cold:
+                mapped_domains.append(mapped_domain)
+        for name in cold_names:
             try:
-                if self._clock() > until or (is_all and self._maps.is_full):
+                if self._clock() > deadline_s or (is_all and self._maps.is_full):
                     raise NotLoadedError(f"the map of domain {name} is not in memory yet: ask again, or warm it before")
-                there.append(self._maps.active(name))
+                mapped_domains.append(self._maps.active(name))
             except NotFoundError:
                 if not is_all:
                     raise
             except DeepSimbadError as error:
                 left_out[name] = error
-        return there, left_out
+        return mapped_domains, left_out
 
     def ask(
         self, domains: Sequence[MappedDomain], evaluator: Evaluator, view: View, n_in_full: int, n_shortlist: int | None
     ) -> Part:
-        """What a view is to domains of one evaluator, by their active maps.
+        """A view's evidence for domains of one evaluator, by their active maps, and where on the likeliest it is.
 
         Args:
-            n_in_full: How many of the likeliest are asked where on them.
-            n_shortlist: As `localize` takes it; of a smaller map all.
+            n_in_full: On how many of the likeliest domains the view is localized.
+            n_shortlist: As `localize` takes it; for a smaller map all of its images.
         """
         log_evidences, left_out = self._log_evidences(domains, evaluator, view)
-        snapshots = {mapped.record.name: mapped.snapshot for mapped in domains}
+        snapshots = {mapped_domain.record.name: mapped_domain.snapshot for mapped_domain in domains}
         likeliest = {}
         for name in _likeliest(log_evidences, n_in_full):
-            n = snapshots[name].n_images
+            n_images = snapshots[name].n_images
             likeliest[name] = localize(
-                snapshots[name], evaluator, view, None if n_shortlist is None else min(n_shortlist, n)
+                snapshots[name], evaluator, view, None if n_shortlist is None else min(n_shortlist, n_images)
             )
         return Part(log_evidences, likeliest, left_out)
 
     def _log_evidences(
         self, domains: Sequence[MappedDomain], evaluator: Evaluator, view: View
     ) -> tuple[dict[str, float], dict[str, DeepSimbadError]]:
-        found, left_out = dict[str, float](), dict[str, DeepSimbadError]()
+        log_evidences, left_out = dict[str, float](), dict[str, DeepSimbadError]()
         encoding = None
         if isinstance(view, EncodedImage):
             encoding = view.values
         elif isinstance(view, ReadyEncoding):
             encoding = ready_encodings(view.values[np.newaxis])[0]
-        together, one_by_one = list[MappedDomain](), list[MappedDomain]()
-        for mapped in domains:
-            alike = encoding is not None and evaluator.is_squared_l2 and _takes(mapped.snapshot, view, encoding)
-            (together if alike else one_by_one).append(mapped)
-        if together and encoding is not None:
-            values = self._atlas_of([mapped.snapshot for mapped in together]).log_evidences(encoding)
-            for mapped, value in zip(together, values.tolist(), strict=True):
-                found[mapped.record.name] = value
-        for mapped in one_by_one:
+        batch, singles = list[MappedDomain](), list[MappedDomain]()
+        for mapped_domain in domains:
+            is_batched = (
+                encoding is not None and evaluator.is_squared_l2 and _takes(mapped_domain.snapshot, view, encoding)
+            )
+            (batch if is_batched else singles).append(mapped_domain)
+        if batch and encoding is not None:
+            values = self._atlas_of([mapped_domain.snapshot for mapped_domain in batch]).log_evidences(encoding)
+            for mapped_domain, value in zip(batch, values.tolist(), strict=True):
+                log_evidences[mapped_domain.record.name] = value
+        for mapped_domain in singles:
             try:
-                found[mapped.record.name] = atlas.log_evidence(
-                    mapped.snapshot, describe(mapped.snapshot, evaluator, view)
+                log_evidences[mapped_domain.record.name] = atlas.log_evidence(
+                    mapped_domain.snapshot, describe(mapped_domain.snapshot, evaluator, view)
                 )
             except DeepSimbadError as error:
-                left_out[mapped.record.name] = error
-        return found, left_out
+                left_out[mapped_domain.record.name] = error
+        return log_evidences, left_out
 
     def _atlas_of(self, snapshots: list[Map]) -> atlas.Atlas:
         with self._lock:
-            last = self._asked
-            if last is None or len(last.maps) != len(snapshots) or any(map(is_not, last.maps, snapshots)):
-                last = self._asked = atlas.Atlas(snapshots)
-            return last
+            atlas_ = self._last_atlas
+            if atlas_ is None or len(atlas_.maps) != len(snapshots) or any(map(is_not, atlas_.maps, snapshots)):
+                atlas_ = self._last_atlas = atlas.Atlas(snapshots)
+            return atlas_
 
 
 def _takes(snapshot: Map, view: View, encoding: np.ndarray) -> bool:
-    """Whether a map can be asked for an encoding with others: all else is asked by itself, and told what is wrong."""
-    usual = snapshot.live_statistics
-    if snapshot.relevance is not Relevance.COMPOSED or usual is None or usual.encodings is None:
+    """Whether a map can be asked for an encoding together with others; else it is asked alone and may raise."""
+    statistics = snapshot.live_statistics
+    if snapshot.relevance is not Relevance.COMPOSED or statistics is None or statistics.encodings is None:
         return False
-    weights, of_map = getattr(view, "weights_sha256", None), snapshot.weights_sha256
-    are_known = weights is not None and of_map is not None
-    return usual.encodings.mean.size == encoding.size and not (are_known and weights != of_map)
+    view_weights, map_weights = getattr(view, "weights_sha256", None), snapshot.weights_sha256
+    are_known = view_weights is not None and map_weights is not None
+    return statistics.encodings.mean.size == encoding.size and not (are_known and view_weights != map_weights)
 
 
 def _likeliest(log_evidences: Mapping[str, float], n: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""Pictures decoded beside the event loop as requests bring them: how many at once, and what is seen of each."""
+"""Pictures decoded beside the event loop as requests bring them, few at once, with remarks on each."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -69,13 +69,13 @@ class Decoders:
 
 
 class Decoded(NamedTuple):
-    """An image, and what is seen of it."""
+    """An image, and what is known of its picture."""
 
     image: Image  # [height, width, 3] uint8 BGR at its evaluator's size
-    is_blank: bool  # whether it shows nothing, as it is encoded: so it is the same for a view that was sent smaller
+    is_blank: bool  # whether it shows nothing; judged at the evaluator's size, so that the size sent does not matter
     size: tuple[int, int] | None  # (width, height) as it was sent, upright by its file; None where nobody can tell
     levels: GreyLevels | None  # by which it is shown; None: it had 8 bits
-    remarks: list[str]  # what a person should know of it
+    remarks: list[str]  # for a person, in sentences
     body: bytes  # the file it came in
 
     @classmethod
@@ -89,18 +89,19 @@ class Decoded(NamedTuple):
     ) -> Self:
         """Decode the file in a body; takes milliseconds.
 
-        Beside pictures of `cameras`, the map's: told where it lies otherwise, and turned where that is NCLT's way.
+        A remark says where it is unlike the pictures of `cameras`, the map's; one that lies on its side in NCLT's way
+        is turned upright.
         """
         ready(evaluator)  # where it is not, decoding is in vain
         pixels, size = decode_deep(file), picture_size(body)
         remarks = [CLIPPED] if levels is not None and clips(pixels, levels) else []
-        pixels, shown_by = in_eight_bits(pixels, levels)
+        pixels, levels_shown = in_eight_bits(pixels, levels)
         if size is not None and (turn := Camera(*size).turn_to(cameras)):
             pixels = np.ascontiguousarray(np.rot90(pixels, -turn // 90))
             remarks.append(f"the view lies on its side as NCLT's files do: it was turned by {turn} degrees")
-        elif size is not None and (why := Camera(*size).unlike(cameras, "the map's")) is not None:
-            remarks.append(f"the view's pixels are not like the map's: {why}")
+        elif size is not None and (difference := Camera(*size).unlike(cameras, "the map's")) is not None:
+            remarks.append(f"the view's pixels are not like the map's: {difference}")
         image = evaluator.prepare(pixels)
         shows_nothing = is_blank(image)
         remarks += [FEW_GREYS] if not shows_nothing and holds_few_greys(image) else []
-        return cls(image, shows_nothing, size, shown_by, remarks, body)
+        return cls(image, shows_nothing, size, levels_shown, remarks, body)

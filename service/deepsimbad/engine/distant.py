@@ -20,7 +20,7 @@ from deepsimbad.evaluators.scenes import Scene
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """What is known of an evaluator by its network alone; see `Evaluator`."""
+    """The attributes of an evaluator that need its network; see `Evaluator`."""
 
     input_size: tuple[int, int] | None
     encoding_dim: int | None
@@ -30,25 +30,25 @@ class NetworkFacts:
 
     @classmethod
     def of(cls, evaluator: Evaluator) -> Self:
-        """Of one that is loaded."""
+        """The facts of an evaluator that is loaded."""
         return cls(**{name: getattr(evaluator, name) for name in cls.__dataclass_fields__})
 
 
 class Encoder(Protocol):
-    """Who has the networks; its promises fail as the evaluator would, or with UnavailableError while it is away."""
+    """A process that has the networks; its futures fail as the evaluator would, or with UnavailableError."""
 
     def facts(self, config: EvaluatorConfig) -> Future[NetworkFacts]:
-        """Of an evaluator, once it is loaded there."""
+        """The facts of an evaluator, once it is loaded there."""
 
     def prepared(self, config: EvaluatorConfig, image: Image) -> Future[Image]:
-        """As `Evaluator.prepare`."""
+        """The image as `Evaluator.prepare` makes it."""
 
     def encoded(self, config: EvaluatorConfig, view: Image | Scene, priority: Priority) -> Future[EncodedImage]:
-        """One view, in a batch with others'."""
+        """The encoding of one view, made in a batch with others."""
 
 
-class EncodedElsewhere:
-    """An `Evaluator` of whose network facts alone are here; what needs none of it is the near one's."""
+class DistantEvaluator:
+    """An `Evaluator` whose network another process has; what needs no network is done by the `near` evaluator."""
 
     def __init__(self, near: Evaluator, config: EvaluatorConfig, encoder: Encoder) -> None:
         self._near, self._config, self._encoder = near, config, encoder
@@ -65,29 +65,31 @@ class EncodedElsewhere:
         self._facts = self._facts or self._encoder.facts(self._config).result()
 
     def prepare(self, image: Image) -> Image:
-        """See `Evaluator`; an image that keeps its aspect, or may be none, travels."""
+        """See `Evaluator`; an image that is not simply resized, or may be none, travels to the encoder."""
         size: tuple[int, int] | None = self.input_size
         is_image = image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size > 0
         return resized(image, size) if size and is_image else self._encoder.prepared(self._config, image).result()
 
     def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
         """See `Evaluator`."""
-        promised = [self.encoded(image, Priority.LIVE) for image in images]
-        return np.array([each.result().values for each in promised], np.float32).reshape(len(images), self.encoding_dim)
+        futures = [self.encoded(image, Priority.LIVE) for image in images]
+        return np.array([future.result().values for future in futures], np.float32).reshape(
+            len(images), self.encoding_dim
+        )
 
     def encoded(self, view: Image | Scene, priority: Priority) -> Future[EncodedImage]:
-        """A view's encoding to come."""
+        """The future encoding of a view."""
         return self._encoder.encoded(self._config, view, priority)
 
 
 def by_encoder(encoder: Encoder) -> Callable[[EvaluatorConfig, Compute | None], Evaluator]:
-    """What makes evaluators as `make_evaluator` does, those that have a network with that of an encoder."""
+    """A function that makes evaluators as `make_evaluator` does; those with a network use the encoder's."""
 
     def make(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
         if not config.has_network:
             return make_evaluator(config, compute)
         near = Fused([make(half, compute) for half in config.of]) if config.of else make_evaluator(config, compute)
-        return cast("Evaluator", EncodedElsewhere(near, config, encoder))
+        return cast("Evaluator", DistantEvaluator(near, config, encoder))
 
     return make
 
@@ -96,6 +98,6 @@ async def encoded(
     worker: InferenceWorker, evaluator: Evaluator, view: Image | Scene, priority: Priority = Priority.LIVE
 ) -> EncodedImage:
     """An image or a scene, encoded by whoever has the network."""
-    if isinstance(evaluator, EncodedElsewhere):
+    if isinstance(evaluator, DistantEvaluator):
         return await asyncio.wrap_future(evaluator.encoded(view, priority))
     return await asyncio.wrap_future(worker.encode(evaluator, view, priority))

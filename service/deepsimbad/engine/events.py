@@ -1,4 +1,4 @@
-"""What happens to a session, told as it happens or from any earlier moment on: its journal, read like a log file."""
+"""A session's events, as they happen or from any earlier moment on: its journal, read like a log file."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -38,48 +38,48 @@ class SessionEvents:
         check_owner(record, key_id)
         return record
 
-    async def follow(self, record: SessionRecord, after: int | None) -> AsyncIterator[SessionEvent | None]:
-        """Every event behind row `after`, then every new one until the session ends; None now and then, for none.
+    async def follow(self, record: SessionRecord, after_sequence: int | None) -> AsyncIterator[SessionEvent | None]:
+        """Every event behind row `after_sequence`, then every new one until the session ends; None while none comes.
 
-        What has passed is computed again, behind every live view: the same journal leads to the same beliefs.
+        Past events are computed again, behind every live view: the same journal leads to the same beliefs.
 
         Args:
             record: The session.
-            after: None: the last event that there was, and what follows.
+            after_sequence: Number of a row; None: the one before the last, so that the last event comes first.
 
         Raises:
             RetiredMapError: The session's map is no more.
             DamagedMapError, DamagedFileError: One of them cannot be read.
         """
         engine = await asyncio.to_thread(self._sessions.engine_of, record)
-        first = record.n_events if after is None else after + 1  # to be told of
+        first = record.n_events if after_sequence is None else after_sequence + 1  # row whose event is yielded
         snapshot = await asyncio.to_thread(self._store.snapshot_before, record.number, first)
-        state = await self._worked(partial(SessionState.restored, engine, snapshot))
+        state = await self._computed(partial(SessionState.restored, engine, snapshot))
         while True:
             live = self._sessions.living(record.session_id)
-            latest = None if live is None else live.state
+            live_state = None if live is None else live.state
             rows: list[JournalRow] = []
-            if live is not None and latest is not None and latest.sequence == state.sequence + 1 >= first:
-                state = latest
-                yield await self._told(record, state, live.expires_at)
+            if live is not None and live_state is not None and live_state.sequence == state.sequence + 1 >= first:
+                state = live_state
+                yield await self._event(record, state, live.expires_at)
                 continue
-            if latest is None or latest.sequence != state.sequence:
+            if live_state is None or live_state.sequence != state.sequence:
                 span = (record.number, state.sequence, state.sequence + _ROWS_AT_ONCE)
                 rows = await asyncio.to_thread(self._store.journal, *span)
             for row in rows:
-                state = await self._worked(partial(state.followed, row))
+                state = await self._computed(partial(state.followed, row))
                 if row.sequence >= first:
-                    yield await self._told(record, state, row.expires_at)
+                    yield await self._event(record, state, row.expires_at)
             if rows:
                 continue
             if live is None:
                 return
             yield None
-            await asyncio.sleep(_GLANCE_S if latest is not None else self._poll_s)
+            await asyncio.sleep(_GLANCE_S if live_state is not None else self._poll_s)
 
-    async def _told(self, record: SessionRecord, state: SessionState, expires_at: float) -> SessionEvent:
+    async def _event(self, record: SessionRecord, state: SessionState, expires_at: float) -> SessionEvent:
         view = await asyncio.to_thread(view_of, LiveSession(record, expires_at), expires_at, state)
         return SessionEvent(state.sequence, view, state.step is not None)
 
-    async def _worked(self, compute: Callable[[], SessionState]) -> SessionState:
+    async def _computed(self, compute: Callable[[], SessionState]) -> SessionState:
         return await asyncio.wrap_future(self._worker.submit(compute, Priority.BATCH))

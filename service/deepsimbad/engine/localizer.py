@@ -35,8 +35,9 @@ from deepsimbad.evaluators.space import seen, squared_between
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
-_BY_INDEX = frozenset(Relevance) - {Relevance.SIMBAD, Relevance.BRUTE_FORCE}  # the others read all encodings or more
-# Of a view that is short
+# Without those that read all encodings or more
+_INDEXED_RELEVANCES = frozenset(Relevance) - {Relevance.SIMBAD, Relevance.BRUTE_FORCE}
+# Bounds of what `is_short`
 _MOST_IMAGES = 1 << 15
 _MOST_SUMMED = 1 << 18  # entries of lists
 _MOST_PRODUCTS = 1 << 22  # of numbers of its encoding with landmarks
@@ -54,14 +55,14 @@ class RankedLandmarks:
 
 @dataclass(frozen=True)
 class PackedRanks:
-    """Ranked landmarks as `core.on_board.pack_ranked_landmarks` makes them; how many bits an id has the map tells."""
+    """Ranked landmarks as `core.on_board.pack_ranked_landmarks` makes them; the map knows how many bits an id has."""
 
     body: bytes
 
 
 @dataclass(frozen=True)
 class PackedUnitEncoding:
-    """What `composed` compares, as `core.on_board.pack_unit_encoding` makes it; how many numbers the map tells."""
+    """What `composed` compares, as `core.on_board.pack_unit_encoding` makes it; the map knows how many numbers."""
 
     body: bytes
 
@@ -96,7 +97,7 @@ View: TypeAlias = (
     | PackedRanks
     | PackedUnitEncoding
 )
-"""One observation: an image [height, width, 3] uint8 BGR, a scene told, or what was made of one here or on board."""
+"""One observation: an image [height, width, 3] uint8 BGR, a scene, or what was made of either here or on board."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def localize(
 
     Args:
         n_shortlist: Length of the shortlist and of the belief's top, 1..n; None: 10, or n where that is less.
-        watch: Told of every stage.
+        watch: Has a lap for every stage.
 
     Raises:
         InvalidInputError: The view or `n_shortlist` cannot be used with this map.
@@ -129,42 +130,44 @@ def localize(
     watch.lap("describe")
     relevance = relevances(snapshot, query)
     watch.lap("retrieve")
-    best = shortlist(relevance, length)
+    ids = shortlist(relevance, length)
     watch.lap("shortlist")
     rule = snapshot.update_rule
-    seen = ViewEvidence.of(relevance, rule, snapshot.log_likelihood_scale)
+    evidence = ViewEvidence.of(relevance, rule, snapshot.log_likelihood_scale)
     belief = GridFilter.uniform(snapshot.route, rule)
     is_informative = query.is_informative and (query.encoding is None or not snapshot.is_strange(query.encoding))
-    belief = belief.updated(seen, step=0) if is_informative else belief
+    belief = belief.updated(evidence, step=0) if is_informative else belief
     summary = summarise(snapshot.route, belief.mass, length, belief.off_route)
     watch.lap("belief")
     plan = None
     if snapshot.view_bits is not None or snapshot.q_values is not None:
         plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(LocalizerState(belief, None, relevance, 1))
     watch.lap("plan")
-    return Localization(snapshot, relevance, best, summary, plan, is_informative)
+    return Localization(snapshot, relevance, ids, summary, plan, is_informative)
 
 
 def is_short(snapshot: Map, view: View, n_shortlist: int | None = None) -> bool:
-    """Whether a view of a map takes some three milliseconds at most, and waits for nothing, once it is encoded."""
+    """Whether an encoded view is answered without waiting, in about three milliseconds at most."""
     n_landmarks = snapshot.n_landmarks
     if isinstance(view, PackedRanks) or (isinstance(view, RankedLandmarks) and len(view.landmark_ids) < n_landmarks):
-        return False  # of landmarks that were not sent the scores are expected ones, which takes more
+        return False  # scores of landmarks that were not sent have to be expected ones, which takes longer
     if isinstance(view, ReadyEncoding | EncodedImage):
         # Others compare by networks of their own, or by those of another process.
         is_plain = snapshot.evaluator.get("kind") == EvaluatorKind.FEATURE_L2
         if not is_plain or view.values.size * n_landmarks > _MOST_PRODUCTS:
             return False
     n_summed = snapshot.list_length * max(snapshot.n_images, n_landmarks)
-    is_listed = snapshot.relevance in _BY_INDEX and n_summed <= _MOST_SUMMED and snapshot.n_images <= _MOST_IMAGES
+    is_listed = (
+        snapshot.relevance in _INDEXED_RELEVANCES and n_summed <= _MOST_SUMMED and snapshot.n_images <= _MOST_IMAGES
+    )
     return is_listed and (n_shortlist or 0) <= _LONGEST_SHORTLIST
 
 
 def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
-    """Rank the landmarks for a view (II-A, II-C); one that shows nothing comes out as uninformative.
+    """Rank the landmarks for a view (II-A, II-C); a view that shows nothing gives an uninformative query.
 
     Raises:
-        InvalidInputError: The view is not of this map.
+        InvalidInputError: The view does not fit this map.
         WeightsDifferError: The map's images were encoded by other weights than the view.
     """
     n_landmarks = snapshot.n_landmarks
@@ -182,8 +185,8 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         if view.values.min() == view.values.max():  # whose difference may be beyond float64
             return Query.uninformative(n_landmarks)
         # Ranks are drawn from the full numbers; those that are compared by squares must stay finite.
-        within = np.clip(view.values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY).astype(np.float32)
-        return Query(rank_landmarks(view.values), within)
+        bounded = np.clip(view.values, -_LARGEST_DISSIMILARITY, _LARGEST_DISSIMILARITY)
+        return Query(rank_landmarks(view.values), bounded.astype(np.float32))
     if isinstance(view, np.ndarray):
         view = evaluator.prepare(view)
         view = NothingSeen() if is_blank(view) else encode_images(evaluator, [view])[0]
@@ -196,12 +199,12 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         encoding = view.values
     else:
         encoding = ready_encodings(view.values[np.newaxis])[0]
-    dissimilarities, compared = seen(evaluator, encoding[None, :], snapshot.landmark_model)
-    return Query(rank_landmarks(dissimilarities[0]), dissimilarities[0], compared[0])
+    dissimilarities, compared_encodings = seen(evaluator, encoding[None, :], snapshot.landmark_model)
+    return Query(rank_landmarks(dissimilarities[0]), dissimilarities[0], compared_encodings[0])
 
 
 def _with_landmarks(snapshot: Map, view: PackedUnitEncoding) -> Dissimilarities:
-    """What was standardised on board by the map's statistics, compared with the map's landmarks."""
+    """The dissimilarities of a unit encoding, standardised on board by the map's statistics, to the map's landmarks."""
     model = snapshot.landmark_model
     if not is_composed(model):
         raise InvalidEncodingError(
@@ -213,7 +216,7 @@ def _with_landmarks(snapshot: Map, view: PackedUnitEncoding) -> Dissimilarities:
 
 
 def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Check encodings [n, d] that were computed elsewhere, of any one length d; float32, the same array if it was so.
+    """Check encodings [n, d] that were computed elsewhere; [n, d] float32, the same array where it is that already.
 
     Raises:
         InvalidEncodingError: Empty, or NaN, infinity or too large a number somewhere.
@@ -231,17 +234,17 @@ def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
     return encodings
 
 
-def shortlist_length(snapshot: Map, wanted: int | None) -> int:
+def shortlist_length(snapshot: Map, n_shortlist: int | None) -> int:
     """How many map images a shortlist holds; raises InvalidInputError."""
-    if wanted is None:
+    if n_shortlist is None:
         return min(DEFAULT_SHORTLIST, snapshot.n_images)
-    if not 1 <= wanted <= snapshot.n_images:
+    if not 1 <= n_shortlist <= snapshot.n_images:
         raise InvalidInputError(
-            f"shortlist is {wanted}; it must be within 1 and the number of map images, {snapshot.n_images}",
+            f"shortlist is {n_shortlist}; it must be within 1 and the number of map images, {snapshot.n_images}",
             minimum=1,
             maximum=snapshot.n_images,
         )
-    return wanted
+    return n_shortlist
 
 
 def warm_up() -> None:

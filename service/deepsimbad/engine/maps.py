@@ -33,7 +33,7 @@ from deepsimbad.store.sessions import SessionStore
 log = logging.getLogger(__name__)
 
 CACHE_BYTES = 1 << 30  # of active maps in memory, where nobody chose
-_N_LOCKS = 64  # of loading: of two domains seldom the same
+_N_LOCKS = 64  # of loading: two domains seldom share one
 _TRUSTED_S = 1.0  # another process (the command line) may activate a map: the catalog is asked again after this
 _DAMAGE_REMEMBERED_S = 5.0  # digesting a large damaged file for every request would be a gift to its sender
 
@@ -49,14 +49,14 @@ class MappedDomain:
 class Maps:
     """Map versions, loaded at first need and each once; usable from any thread.
 
-    The active map of a domain is held and switched by one reference assignment; requests read one dict entry. Whoever
-    holds a snapshot keeps it whatever is activated or removed meanwhile, or gives way to others: of active maps those
-    that were asked last stay in memory, as many as `cache_bytes` hold, and one at least.
+    The active map of a domain is held and switched by one reference assignment; requests read one dict entry. Of active
+    maps those that were asked last stay in memory, as many as `cache_bytes` hold, and one at least. Whoever holds a
+    snapshot keeps it, whatever is activated, removed or dropped from memory meanwhile.
 
     Args:
         catalog: Says which versions there are, and which serve.
         clock: Monotonic seconds.
-        cache_bytes: Of the arrays of active maps in memory.
+        cache_bytes: Most bytes of arrays of active maps in memory; one map may have more.
     """
 
     def __init__(
@@ -67,13 +67,13 @@ class Maps:
         self._cache_bytes = cache_bytes
         self._n_bytes = 0
         self._confirmed_at = -math.inf
-        self._active: OrderedDict[str, MappedDomain] = OrderedDict()  # who was asked last is last
+        self._active: OrderedDict[str, MappedDomain] = OrderedDict()  # by domain, the one asked last at the end
         self._checked_at: dict[str, float] = {}
-        self._damaged: dict[str, tuple[int, DamagedMapError, float]] = {}  # version, why, and when that was noticed
-        self._announced: dict[str, int] = {}
-        self._began_at = current_moment()  # what was activated before is no news
+        self._damages: dict[str, tuple[int, DamagedMapError, float]] = {}  # by domain: version, error, when noticed
+        self._announced_versions: dict[str, int] = {}
+        self._began_at = current_moment()  # maps activated before it are not logged
         # By domain, version and digest: a domain that was deleted and made anew has other maps.
-        self._held: WeakValueDictionary[tuple[str, int, str | None], Map] = WeakValueDictionary()
+        self._snapshots: WeakValueDictionary[tuple[str, int, str | None], Map] = WeakValueDictionary()
         self._loading = tuple(threading.RLock() for _ in range(_N_LOCKS))  # who asks for a map being read waits for it
         self._n_beginning: Counter[tuple[str, int]] = Counter()
         self._counting = threading.Lock()
@@ -87,39 +87,39 @@ class Maps:
 
     @property
     def n_bytes(self) -> int:
-        """And how many bytes their arrays have."""
+        """How many bytes the arrays of the active maps in memory have."""
         return self._n_bytes
 
     @property
     def is_full(self) -> bool:
-        """Whether a further map would hardly have room without another's giving way."""
+        """Whether a further map of mean size would take the place of another."""
         return self._n_bytes + self._n_bytes // max(len(self._active), 1) > self._cache_bytes
 
     def loaded(self) -> list[MappedDomain]:
         """The domains whose active maps are in memory, by name."""
-        return sorted(self._active.copy().values(), key=lambda mapped: mapped.record.name)
+        return sorted(self._active.copy().values(), key=lambda mapped_domain: mapped_domain.record.name)
 
     def damaged(self) -> dict[str, int]:
-        """The active versions that cannot be loaded, by domain; each is tried again, which reads its file."""
-        still_damaged = {}
-        for domain, (version, *_) in sorted(self._damaged.copy().items()):
+        """The numbers of active versions that cannot be loaded, by domain; tries each again, which reads its file."""
+        damaged_versions = {}
+        for domain, (version, *_) in sorted(self._damages.copy().items()):
             try:
                 self.refresh(domain)
             except UnavailableError as error:  # a disk that fails to read it now has not made it whole
-                still_damaged[domain] = int(error.hints.get("map_version", version))
+                damaged_versions[domain] = int(error.hints.get("map_version", version))
             except DeepSimbadError:  # deleted, or has no active map any more
-                self._damaged.pop(domain, None)
-        return still_damaged
+                self._damages.pop(domain, None)
+        return damaged_versions
 
     def peek(self, domain: str) -> MappedDomain | None:
         """The domain and its active map if that is known without touching a file, else None."""
         if self._clock() - self._checked_at.get(domain, float("-inf")) > _TRUSTED_S:
             return None
-        mapped = self._active.get(domain)
-        if mapped is not None:
+        mapped_domain = self._active.get(domain)
+        if mapped_domain is not None:
             with suppress(KeyError):  # it gave way this moment
                 self._active.move_to_end(domain)
-        return mapped
+        return mapped_domain
 
     def active(self, domain: str) -> MappedDomain:
         """The domain and its active map; may read files.
@@ -141,58 +141,58 @@ class Maps:
                 self._let_go(domain)
                 raise
             self._keep(active)
-            self._damaged.pop(domain, None)
+            self._damages.pop(domain, None)
             self._checked_at[domain] = self._clock()
             return active
 
     def confirm(self) -> None:
-        """Ask the catalog once, at most once a second, which maps in memory still serve: for who looks at many."""
-        at = self._clock()
-        if at - self._confirmed_at <= _TRUSTED_S:
+        """Ask the catalog once for all maps in memory, at most once a second, which of them still serve."""
+        now_s = self._clock()
+        if now_s - self._confirmed_at <= _TRUSTED_S:
             return
-        self._confirmed_at = at
-        held = self._active.copy()
-        serving = self._catalog.serving_versions(list(held))
-        for domain, mapped in held.items():
-            if serving.get(domain) == (mapped.record.created_at, mapped.snapshot.version):
-                self._checked_at[domain] = at
+        self._confirmed_at = now_s
+        mapped_domains = self._active.copy()
+        serving = self._catalog.serving_versions(list(mapped_domains))
+        for domain, mapped_domain in mapped_domains.items():
+            if serving.get(domain) == (mapped_domain.record.created_at, mapped_domain.snapshot.version):
+                self._checked_at[domain] = now_s
 
     def forget(self, domain: str) -> None:
         """Let go of a deleted domain's map."""
         with self._lock_of(domain):
             self._let_go(domain)
-            self._damaged.pop(domain, None)
-            self._announced.pop(domain, None)
+            self._damages.pop(domain, None)
+            self._announced_versions.pop(domain, None)
 
     def load_all(self, within_s: float = math.inf) -> list[str]:
-        """Load active maps, those activated last first, and answer which domains' are damaged.
+        """Load active maps, those activated last first; the names of the domains whose maps are damaged.
 
-        Those are logged, and so are those that could not be read; neither keeps the service from starting. What has
-        no room, or no time, is loaded when it is asked for.
+        Damaged and unreadable maps are logged and keep no service from starting. A map for which there is no room or no
+        time is loaded when it is asked for.
         """
-        damaged, until = [], self._clock() + within_s
+        damaged_domains, deadline_s = [], self._clock() + within_s
         for domain in self._catalog.serving_domains():
-            if self.is_full or self._clock() > until:
+            if self.is_full or self._clock() > deadline_s:
                 break
             try:
                 self.refresh(domain)
             except DamagedMapError:
-                damaged.append(domain)
+                damaged_domains.append(domain)
             except UnavailableError as error:
                 log.warning("an active map could not be read", extra={"domain": domain, "why": error.message})
             except NotFoundError:
                 continue  # deleted this moment
-        return damaged
+        return damaged_domains
 
     def _lock_of(self, domain: str) -> threading.RLock:
         return self._loading[hash(domain) % _N_LOCKS]
 
-    def _keep(self, mapped: MappedDomain) -> None:
-        """Hold a map; those asked longest ago give way to it."""
+    def _keep(self, mapped_domain: MappedDomain) -> None:
+        """Hold an active map, and drop from memory those asked longest ago for which there is no room."""
         with self._counting:
-            before = self._active.pop(mapped.record.name, None)
-            self._active[mapped.record.name] = mapped
-            self._n_bytes += mapped.snapshot.n_bytes - (before.snapshot.n_bytes if before else 0)
+            previous = self._active.pop(mapped_domain.record.name, None)
+            self._active[mapped_domain.record.name] = mapped_domain
+            self._n_bytes += mapped_domain.snapshot.n_bytes - (previous.snapshot.n_bytes if previous else 0)
             while self._n_bytes > self._cache_bytes and len(self._active) > 1:
                 domain, oldest = self._active.popitem(last=False)
                 self._checked_at.pop(domain, None)
@@ -200,8 +200,8 @@ class Maps:
 
     def _let_go(self, domain: str) -> None:
         with self._counting:
-            mapped = self._active.pop(domain, None)
-            self._n_bytes -= mapped.snapshot.n_bytes if mapped else 0
+            mapped_domain = self._active.pop(domain, None)
+            self._n_bytes -= mapped_domain.snapshot.n_bytes if mapped_domain else 0
         self._checked_at.pop(domain, None)
 
     def _current_or_last(self, record: DomainRecord) -> Map:
@@ -211,53 +211,53 @@ class Maps:
         except DamagedMapError:
             raise
         except UnavailableError:
-            last = self._active.get(record.name)
-            if last is None or last.record.created_at != record.created_at:
+            mapped_domain = self._active.get(record.name)
+            if mapped_domain is None or mapped_domain.record.created_at != record.created_at:
                 raise
-            return last.snapshot
+            return mapped_domain.snapshot
 
     def _current(self, record: DomainRecord) -> Map:
         domain, version = record.name, record.active_version
         if version is None:
             raise no_active_map(domain)
-        if domain in self._damaged:
-            damaged_version, why, noticed_at = self._damaged[domain]
+        if domain in self._damages:
+            damaged_version, damage, noticed_at = self._damages[domain]
             if damaged_version == version and self._clock() - noticed_at < _DAMAGE_REMEMBERED_S:
-                raise DamagedMapError(why.message, **why.hints) from why
+                raise DamagedMapError(damage.message, **damage.hints) from damage
         try:
-            its_map = self._catalog.map(domain, version)
-            snapshot = self._load(domain, version, its_map.sha256)
+            map_record = self._catalog.map(domain, version)
+            snapshot = self._load(domain, version, map_record.sha256)
         except DamagedMapError as error:
-            self._damaged[domain] = version, error, self._clock()
+            self._damages[domain] = version, error, self._clock()
             log.error("damaged map", extra={"domain": domain, "map_version": version}, exc_info=error)
             raise
-        self._announce(domain, version, its_map.activated_at or "")
+        self._announce(domain, version, map_record.activated_at or "")
         return snapshot
 
     def _load(self, domain: str, version: int, digest: str | None) -> Map:
-        snapshot = self._held.get((domain, version, digest))
+        snapshot = self._snapshots.get((domain, version, digest))
         if snapshot is None:
-            snapshot = self._held[domain, version, digest] = load_snapshot(self._catalog, domain, version)
+            snapshot = self._snapshots[domain, version, digest] = load_snapshot(self._catalog, domain, version)
         return snapshot
 
     def _announce(self, domain: str, version: int, activated_at: str) -> None:
-        """Say in the log that another version serves than before, whoever switched it."""
-        before = self._announced.get(domain)
-        if before != version and activated_at >= self._began_at:
+        """Log that another version serves than before, whoever activated it."""
+        previous_version = self._announced_versions.get(domain)
+        if previous_version != version and activated_at >= self._began_at:
             log.info(
-                "map activated" if before is None or version > before else "map rolled back",
-                extra={"domain": domain, "map_version": version, "before": before},
+                "map activated" if previous_version is None or version > previous_version else "map rolled back",
+                extra={"domain": domain, "map_version": version, "before": previous_version},
             )
-        self._announced[domain] = version
+        self._announced_versions[domain] = version
 
     # Those that sessions are pinned to
 
     @contextmanager
     def beginning(self, snapshot: Map) -> Iterator[None]:
-        """A session is about to begin on a version, which keeps its file until the session's own row says that it must.
+        """Keep a version's file inside the block, in which a session begins on it, until the session's row pins it.
 
-        Entered before the catalog is asked in `digest`; who removes a version notes that in the catalog and asks here
-        then, so that one of the two sees the other.
+        Enter it before `digest` asks the catalog: whoever removes a version first notes that in the catalog and then
+        asks `is_beginning`, so that one of the two sees the other.
         """
         version = snapshot.domain, snapshot.version
         with self._counting:
@@ -269,7 +269,7 @@ class Maps:
                 self._n_beginning[version] -= 1
 
     def is_beginning(self, domain: str, version: int) -> bool:
-        """Whether a session is about to begin on a version. Waits for nobody who reads a file."""
+        """Whether a session is about to begin on a version; never waits for a file to be read."""
         with self._counting:
             return self._n_beginning[domain, version] > 0
 
@@ -294,11 +294,11 @@ class Maps:
         """
         with self._lock_of(domain):
             try:
-                record, its_map = self._catalog.domain(domain), self._catalog.map(domain, version)
+                record, map_record = self._catalog.domain(domain), self._catalog.map(domain, version)
             except (UnknownDomainError, UnknownMapVersionError) as error:
                 raise retired(domain, version) from error
-            is_removed = its_map.state is not MapState.ACTIVE and not self._catalog.has_file(domain, version)
-            if its_map.sha256 != digest or (is_removed and (domain, version, digest) not in self._held):
+            is_removed = map_record.state is not MapState.ACTIVE and not self._catalog.has_file(domain, version)
+            if map_record.sha256 != digest or (is_removed and (domain, version, digest) not in self._snapshots):
                 raise retired(domain, version)
             return MappedDomain(record, self._load(domain, version, digest))
 
@@ -308,13 +308,13 @@ class Maps:
 
     def holds(self, domain: str, version: int, digest: str) -> bool:
         """Whether a version is in memory."""
-        return (domain, version, digest) in self._held
+        return (domain, version, digest) in self._snapshots
 
     def snapshot(self, domain: str, version: int) -> Map:
-        """A sealed map version that need not serve, as a session may be pinned to one; may read files.
+        """A sealed map version, whether or not it serves; may read files.
 
         Raises:
-            UnknownDomainError, UnknownMapVersionError: There is none, or it is still being built.
+            UnknownDomainError, UnknownMapVersionError: There is no such version, or it is still being built.
             RetiredMapError: It was removed.
             DamagedMapError: Its file is damaged, or missing though the version serves.
         """
@@ -330,8 +330,8 @@ class Retention:
     """Removes the files of old map versions; usable from any thread.
 
     A domain keeps its newest `keep_maps` retired versions to roll back to, and every version that a living session is
-    pinned to. Of versions that were sealed but never served it keeps as many; older ones that lost to the version that
-    serves go too.
+    pinned to. Of the versions that were sealed but never served, it keeps the newest `keep_maps`, and all that are
+    newer than the version that serves.
     """
 
     def __init__(self, catalog: Catalog, sessions: SessionStore, maps: Maps, keep_maps: int) -> None:
@@ -341,24 +341,24 @@ class Retention:
         self._keep_maps = keep_maps
 
     def prune(self, domain: str | None = None) -> int:
-        """Remove what is beyond keeping, of one domain or all; answers how many versions it was.
+        """Remove the surplus versions of one domain, or of all; how many were removed.
 
-        What cannot be removed now, because of a session or the disk, is tried again the next time: whoever asks has
-        something else to do that must not fail for it.
+        A version that cannot be removed now, because of a session or the disk, is left for the next time and raises
+        nothing: the caller's own work must not fail for it.
         """
         try:
-            beyond = beyond_keeping(self._catalog.kept_maps(domain, self._keep_maps), self._keep_maps)
-            pins = self._sessions.pins() if beyond else set()
+            surplus = surplus_versions(self._catalog.kept_maps(domain, self._keep_maps), self._keep_maps)
+            pins = self._sessions.pins() if surplus else set()
         except DeepSimbadError:
             log.exception("old maps could not be looked for")
             return 0
         n_removed = 0
-        for old in beyond:
-            if (old.domain, old.version) in pins:
+        for kept_map in surplus:
+            if (kept_map.domain, kept_map.version) in pins:
                 continue
-            labels = {"domain": old.domain, "map_version": old.version}
+            labels = {"domain": kept_map.domain, "map_version": kept_map.version}
             try:
-                self.remove(old.domain, old.version)
+                self.remove(kept_map.domain, kept_map.version)
             except (MapInUseError, RetiredMapError, NotFoundError):
                 continue  # somebody was faster
             except DeepSimbadError:
@@ -373,7 +373,7 @@ class Retention:
 
         Raises:
             UnknownDomainError, UnknownMapVersionError: There is no such version.
-            RetiredMapError: It was removed before.
+            RetiredMapError: It is removed already.
             MapInUseError: It serves, is being built, or a living session is pinned to it.
         """
 
@@ -384,17 +384,17 @@ class Retention:
         self._catalog.remove_map(domain, version, is_pinned)
 
 
-def beyond_keeping(versions: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
-    """Of the versions that have their files, ordered by domain, those beyond what a domain keeps, pinned or not."""
-    beyond: list[KeptMap] = []
+def surplus_versions(versions: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
+    """The versions that no domain keeps, pinned or not, of versions that have their files and are ordered by domain."""
+    surplus: list[KeptMap] = []
     for _, of_domain in groupby(versions, lambda version: version.domain):
         newest_first = sorted(of_domain, key=lambda version: (version.retired_at or "", version.version), reverse=True)
         retired = [version for version in newest_first if version.state is MapState.RETIRED]
         sealed = [version for version in newest_first if version.state is MapState.SEALED]
         active = max((version.version for version in newest_first if version.state is MapState.ACTIVE), default=0)
-        beyond += retired[keep_maps:]
-        beyond += [version for version in sealed[keep_maps:] if version.version < active]  # a newer one may soon serve
-    return beyond
+        surplus += retired[keep_maps:]
+        surplus += [version for version in sealed[keep_maps:] if version.version < active]  # a newer one may soon serve
+    return surplus
 
 
 def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
@@ -431,7 +431,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
 
 
 def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
-    """The cause names a file of the server's; this names what a person can act on."""
+    """The error for a map file that cannot be read: its cause names a file, this what a person can do."""
     if catalog.map(domain, version).removed_at is not None:  # just now
         return removal_error(domain, version)
     return DamagedMapError(
@@ -442,12 +442,12 @@ def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
 
 
 def no_active_map(domain: str) -> NoActiveMapError:
-    """What is said of a domain before its first map."""
+    """The error for a domain before its first map."""
     return NoActiveMapError(f"domain {domain} has no active map: upload traverses and start a remap", domain=domain)
 
 
 def retired(domain: str, version: int) -> RetiredMapError:
-    """What is said to a session whose map is no more."""
+    """The error for a session whose map is no more."""
     return RetiredMapError(
         f"map {version} of domain {domain}, which the session was begun on, is no more: begin a new session",
         domain=domain,

@@ -1,4 +1,4 @@
-"""Pictures for people: small ones of a domain's frames, where it keeps them, and of what every robot saw last."""
+"""Pictures for people: small ones of a domain's frames, where it keeps them, and of every session's last view."""
 
 import threading
 from collections import OrderedDict
@@ -19,7 +19,7 @@ _VIEW_HEIGHT = 240
 
 
 class Pictures:
-    """All of one service; usable from any thread."""
+    """All pictures of one service; usable from any thread."""
 
     def __init__(self, data_dir: Path, max_pixels: int) -> None:
         self._data_dir = data_dir
@@ -27,12 +27,12 @@ class Pictures:
         self._views: OrderedDict[str, bytes] = OrderedDict()  # by session, as they came
         self._lock = threading.Lock()
 
-    def keep(self, domain: str, seen: Iterable[tuple[int, bytes]]) -> None:
-        """Keep small pictures of frames, by their digests; what is no image is passed over."""
+    def keep(self, domain: str, frames: Iterable[tuple[int, bytes]]) -> None:
+        """Keep small pictures of frames, given as digest and file; a file that is no image is passed over."""
         with self._open(domain, create=True) as file:
-            for frame_digest, body in seen:
-                if (small := thumbnail(body, self._max_pixels)) is not None:
-                    file.put(frame_digest, small)
+            for frame_digest, body in frames:
+                if (picture := thumbnail(body, self._max_pixels)) is not None:
+                    file.put(frame_digest, picture)
 
     def of_frame(self, snapshot: Map, digests: NDArray[np.uint64] | None, number: int) -> bytes:
         """The JPEG of a map image or a landmark, by the digests of all of them; raises UnknownThumbnailError."""
@@ -42,23 +42,23 @@ class Pictures:
             return file.get(int(digests[number]))
 
     def n_bytes(self, domain: str) -> int:
-        """Of all small pictures of a domain."""
+        """The bytes of all small pictures of a domain."""
         try:
             with self._open(domain) as file:
                 return file.n_bytes
         except UnknownThumbnailError:
             return 0
 
-    def saw(self, session_id: str, body: bytes) -> None:
-        """Hold what a robot saw last, in memory alone; for domains that keep pictures."""
+    def hold_view(self, session_id: str, body: bytes) -> None:
+        """Hold the file of a session's last view, in memory alone; for domains that keep pictures."""
         with self._lock:
             self._views.pop(session_id, None)
             self._views[session_id] = body
             while len(self._views) > _MOST_VIEWS or sum(map(len, self._views.values())) > _MOST_VIEW_BYTES:
                 self._views.popitem(last=False)
 
-    def seen(self, session_id: str) -> bytes | None:
-        """A small JPEG of that; None: it is not held."""
+    def view(self, session_id: str) -> bytes | None:
+        """A small JPEG of a session's last view; None where it is not held."""
         body = self._views.get(session_id)
         return None if body is None else thumbnail(body, self._max_pixels, _VIEW_HEIGHT)
 

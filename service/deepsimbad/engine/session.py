@@ -1,6 +1,6 @@
-"""One session: what it is begun with, what it believes, and how every row of its journal moves it on.
+"""One session: its configuration, its belief, and how every row of its journal moves it on.
 
-Live and after a restart it is moved on by the same function, so a journal leads to the same bits.
+The same function moves it on live and after a restart, so a journal leads to the same bits.
 """
 
 import asyncio
@@ -47,7 +47,7 @@ DOMAIN_DIGITS = 8  # of a session's id
 
 
 def domain_digits(domain: str) -> str:
-    """The digits that tell a domain in the ids of its sessions, so that who has an id knows whom to ask."""
+    """The digits that stand for a domain in the ids of its sessions, so that an id alone tells which domain to ask."""
     return hashlib.sha256(domain.encode("utf-8", "surrogatepass")).hexdigest()[:DOMAIN_DIGITS]
 
 
@@ -65,35 +65,36 @@ class SessionConfig:
     price_bits_per_m: float = 0.0  # of moving, to the planner
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """The configuration as JSON-ready values by name."""
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
-        """What `as_dict` gave."""
-        update = stored["update"]
-        enums = {"belief": FilterKind(stored["belief"]), "update": None if update is None else UpdateRule(update)}
-        return cls(**{**stored, **enums})
+    def from_dict(cls, document: dict[str, Any]) -> Self:
+        """The configuration of which `as_dict` made the document."""
+        update = document["update"]
+        enums = {"belief": FilterKind(document["belief"]), "update": None if update is None else UpdateRule(update)}
+        return cls(**{**document, **enums})
 
 
 @dataclass(frozen=True)
 class Observation:
     """A move and the view after it, as a robot reports them."""
 
-    # Gives the view as the evaluator and the map it is given want it, and what a person should know of it. Called in
-    # the session's turn: order is that of arrival
+    # Decodes the view for an evaluator and a map, and makes remarks on it for a person; called in the session's turn,
+    # in order of arrival
     view: Callable[[Evaluator, Map], Awaitable[tuple[View, Sequence[str]]]]
     action_m: float = 0.0  # metres moved since the last view; ignored for the first one
-    action_std_m: float | None = None  # None: as usual
-    n_shortlist: int | None = None  # length of the answer's lists; None: the usual one
-    idempotency: IdempotencyKey | None = None  # how a repetition is known; None: it is not
-    landmark_models: frozenset[str] | None = None  # digests, by one of which the view was ranked; None: nobody said
+    action_std_m: float | None = None  # None: that of usual odometry
+    n_shortlist: int | None = None  # length of the answer's lists; None: the default
+    idempotency: IdempotencyKey | None = None  # by which a repetition is recognised; None: it is not
+    landmark_models: frozenset[str] | None = None  # digests, one of which the map must have; None: any will do
 
     def check(self, snapshot: Map) -> None:
-        """Refuse a shortlist, or a move that no robot of the domain makes: backward within its error is none.
+        """Refuse a shortlist or a move that is impossible on a map; a move backward within its error is allowed.
 
         Raises:
-            InvalidInputError, InvalidMoveError: Not one of this map.
+            InvalidInputError: The shortlist is longer than the map.
+            InvalidMoveError: The move or its deviation is NaN, or farther than a robot of the domain moves.
         """
         shortlist_length(snapshot, self.n_shortlist)
         action_m, std_m, longest_m = self.action_m, self.action_std_m, _LONGEST_MOVE_ACTIONS * snapshot.longest_action_m
@@ -112,7 +113,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class SessionEngine:
-    """What moves one session on."""
+    """All that is needed to move one session on."""
 
     config: SessionConfig
     snapshot: Map
@@ -120,7 +121,7 @@ class SessionEngine:
 
     @cached_property
     def localizer(self) -> ActiveLocalizer:
-        """The algorithm; raises InvalidInputError where the configuration cannot be."""
+        """The algorithm; raises InvalidInputError where the configuration does not fit the map."""
         config = self.config
         algorithm = LocalizerConfig(
             filter=config.belief,
@@ -134,7 +135,7 @@ class SessionEngine:
 
 @dataclass(frozen=True)
 class SessionState:
-    """What a session believes after a row of its journal; immutable, published by one assignment, read with no lock."""
+    """A session's belief after a row of its journal; immutable, published by one assignment, read with no lock."""
 
     engine: SessionEngine  # moves it on
     sequence: int  # that row's number; 0 before any
@@ -143,10 +144,10 @@ class SessionState:
 
     @classmethod
     def start(cls, engine: SessionEngine) -> Self:
-        """Before anything has happened."""
+        """The state before the first row."""
         return cls(engine, 0, engine.localizer.start(engine.config.start_position_m, engine.config.start_std_m))
 
-    def after(self, row: JournalRow) -> "SessionState":
+    def next_state(self, row: JournalRow) -> "SessionState":
         """The state after one more row; raises InvalidInputError."""
         if isinstance(row, PriorRow):
             belief = self.engine.localizer.with_prior(self.belief, row.position_m, row.std_m)
@@ -156,12 +157,12 @@ class SessionState:
         return SessionState(self.engine, row.sequence, step.state, step)
 
     def snapshot(self) -> StateSnapshot:
-        """In the store's form."""
+        """The state as the store keeps it."""
         return StateSnapshot(self.sequence, self.engine.localizer.to_arrays(self.belief))
 
     @classmethod
     def restored(cls, engine: SessionEngine, snapshot: StateSnapshot | None) -> Self:
-        """What `snapshot` gave, of this session; None: before anything happened. Raises DamagedFileError."""
+        """The state of which `snapshot` was made; None: the state before the first row. Raises DamagedFileError."""
         with _journal_faults():
             if snapshot is None:
                 return cls.start(engine)
@@ -175,7 +176,7 @@ class SessionState:
         if row.sequence != self.sequence + 1:
             raise DamagedFileError(f"row {self.sequence + 1} of a session's journal is missing")
         with _journal_faults():
-            return self.after(row)
+            return self.next_state(row)
 
 
 @contextmanager
@@ -196,33 +197,33 @@ async def replayed_until(
     is_last: Callable[[JournalRow, SessionState], bool],
     snapshot: StateSnapshot | None = None,
 ) -> SessionState:
-    """A session's state after the first row that is the last one wanted, computed behind every live view.
+    """A session's state after the first row for which `is_last` holds, computed behind every live view.
 
-    That takes as long as its observations took, but in short pieces, a few rows of the journal in memory at a time.
+    It takes as long as the observations took, but in short pieces, with a few rows of the journal in memory at a time.
 
     Args:
-        is_last: Asked on the worker of every row and the state after it.
-        snapshot: Where to begin; None: before anything happened.
+        is_last: Called on the worker with every row and the state after it.
+        snapshot: The state to begin from; None: the one before the first row.
 
     Raises:
-        UnknownSessionError: The journal ends before; it was purged meanwhile.
-        DamagedFileError: The journal cannot be of this session.
+        UnknownSessionError: The journal ends before such a row; it was purged meanwhile.
+        DamagedFileError: The journal does not fit the session.
     """
     state = await asyncio.wrap_future(worker.submit(lambda: SessionState.restored(engine, snapshot), Priority.BATCH))
     is_done = False
 
     def piece(rows: Iterator[JournalRow]) -> None:
         nonlocal state, is_done
-        began = perf_counter()
+        start_s = perf_counter()
         for row in rows:
             state = state.followed(row)
             is_done = is_last(row, state)
-            if is_done or perf_counter() - began > _PIECE_S:
+            if is_done or perf_counter() - start_s > _PIECE_S:
                 break
 
     while not is_done:
-        after = state.sequence
-        rows = await asyncio.to_thread(store.journal, record.number, after, after + _ROWS_AT_ONCE)
+        sequence = state.sequence
+        rows = await asyncio.to_thread(store.journal, record.number, sequence, sequence + _ROWS_AT_ONCE)
         if not rows:
             raise UnknownSessionError(f"there is no session {record.session_id!a}")
         run = partial(piece, iter(rows))
@@ -235,7 +236,7 @@ async def replayed_until(
 class LiveSession:
     """A session that has not ended; touched from the event loop alone."""
 
-    record: SessionRecord  # as it was begun
+    record: SessionRecord  # its row as it began
     expires_at: float  # unless something happens to it; seconds since 1970
     state: SessionState | None = None  # what answers, once it is on the disk; None until first needed after a start
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)  # of whoever moves it on; first come, first served
@@ -249,7 +250,7 @@ class SessionView:
     session_id: str
     expires_at: float  # unless something happens to it; seconds since 1970
     snapshot: Map  # the map it is pinned to
-    n_observations: int  # that its belief rests on
+    n_observations: int  # of which its belief is made
     belief: BeliefSummary
     plan: Plan | None  # the move to make next; None where the map can name none
     relevance: NDArray[np.float32] | None  # [n] of the last view; None before any
@@ -257,11 +258,11 @@ class SessionView:
     is_confident: bool = False  # whether it is as sure of its place as was asked
     is_informative: bool = True  # whether the last view changed the belief
     is_repeated: bool = False  # whether the observation had been counted before
-    remarks: Sequence[str] = ()  # what a person should know of the view
+    remarks: Sequence[str] = ()  # for a person, on the view
 
 
 def view_of(live: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:
-    """Summarise a state, with lists of the usual length or another; milliseconds of work."""
+    """Summarise a state, with lists of the default length where `n_shortlist` is None; milliseconds of work."""
     snapshot, belief, step = state.engine.snapshot, state.belief, state.step
     length = shortlist_length(snapshot, n_shortlist)
     summary = summarise(snapshot.route, belief.belief.mass, length, belief.belief.off_route)
@@ -280,11 +281,11 @@ def view_of(live: LiveSession, expires_at: float, state: SessionState, n_shortli
 
 
 def check_prior(route: Route, position_m: float | None, std_m: float) -> None:
-    """Refuse a prior that is no belief on the route; no position is anywhere on it.
+    """Refuse a prior that is no belief on the route; without a position it is uniform over the route.
 
     Raises:
-        InvalidPriorError: NaN or infinity, a deviation that is not positive, or a position so far beyond the route
-            that the robot would hardly be on it.
+        InvalidPriorError: A value is NaN or infinite, the deviation is not positive, or the position is so far beyond
+            the route that the robot would hardly be on it.
     """
     if not (math.isfinite(std_m) and 0 < std_m <= _LARGEST_STD_M):
         raise InvalidPriorError(

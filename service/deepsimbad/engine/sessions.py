@@ -48,17 +48,17 @@ from deepsimbad.store.sessions import JournalRow, ListedSession, ObservedRow, Pr
 T = TypeVar("T")
 
 DELETED, EXPIRED = "deleted", "expired"
-_ENCODED = {Relevance.COMPOSED, Relevance.BRUTE_FORCE}  # relevances that compare encodings
-_MEASURED = {Relevance.COMPOSED, Relevance.SIMBAD}  # and dissimilarities
+_ENCODING_RELEVANCES = {Relevance.COMPOSED, Relevance.BRUTE_FORCE}  # relevances that compare encodings
+_DISSIMILARITY_RELEVANCES = {Relevance.COMPOSED, Relevance.SIMBAD}  # and dissimilarities
 _LONGEST_RETRY_S = 60
 
 
 class Sessions:
     """All sessions of the service; used from one event loop.
 
-    A change that was begun is finished even if its asker goes away: it may already be on the disk. One that fails
-    leaves the session as it was. `key_id` is everywhere the API key whose sessions alone are known to the asker; None:
-    all are.
+    A change that has begun is finished even if its caller goes away: it may already be on the disk. A change that fails
+    leaves the session as it was. Everywhere `key_id` is the API key whose sessions alone the caller may know of; None:
+    it may know of all.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Sessions:
         evaluators: EvaluatorPool,
         worker: InferenceWorker,
         *,
-        ttl_s: float,  # a session ends when nothing happened to it for so long
+        ttl_s: float,  # time after its last change at which a session ends
         max_sessions: int,  # that live at once
         max_sessions_per_key: int,
-        snapshot_every: int,  # rows of a journal: how much is replayed after a start
-        keep_ended_s: float,  # an ended session is known, with what it saw, for so long
+        snapshot_every: int,  # rows of a journal between snapshots; so many are replayed after a start
+        keep_ended_s: float,  # time for which an ended session and its observations are kept
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._store = store
@@ -85,21 +85,21 @@ class Sessions:
         self._snapshot_every = snapshot_every
         self._keep_ended_s = keep_ended_s
         self._clock = clock
-        self._beginning: Counter[str | None] = Counter()  # by key
+        self._n_beginning: Counter[str | None] = Counter()  # by key
         self._repeating = asyncio.Lock()
-        # What only reads should not keep a robot's next step waiting on the worker.
+        # A thread of their own, because what only reads should not keep a robot's next step waiting for the worker
         self._summaries = ThreadPoolExecutor(1, "summaries")
         self._under_way: set[asyncio.Task[Any]] = set()
-        # Only who they are; what they believe is read at first touch, so a start takes no longer for many sessions.
+        # Without their states, which are read at first need, so that a start takes no longer for many sessions
         self._living = {record.session_id: LiveSession(record, record.expires_at) for record in store.living_sessions()}
 
     @property
     def n_living(self) -> int:
-        """How many sessions have not ended, as far as is known without looking."""
+        """How many sessions have not ended, as far as is known without reading the store."""
         return len(self._living)
 
     def living(self, session_id: str) -> LiveSession | None:
-        """A session that has not ended, as far as is known without looking; None: there is none such."""
+        """A session that has not ended, as far as is known without reading the store; None where there is none."""
         live = self._living.get(session_id)
         return None if live is None or live.ending is not None else live
 
@@ -113,14 +113,14 @@ class Sessions:
         """Begin a session on a domain's active map.
 
         Args:
-            session_id: Its id, where a repetition of the request would have the same: the session that was begun by
-                the first one is answered then, as it stands. None: a new one.
+            session_id: An id that repetitions of the request share: where such a session was begun already, that one is
+                returned as it stands. None: a random id.
             key_id: The API key that it belongs to; None: no key is asked.
 
         Raises:
-            InvalidInputError: The start or the configuration cannot be.
-            TooManySessionsError: As many live as may, of all or of this key.
-            IdempotencyKeyReusedError: A session of that id was begun with another configuration.
+            InvalidInputError: The start or the configuration does not fit the map.
+            TooManySessionsError: The limit on living sessions, of all or of this key, is reached.
+            IdempotencyKeyReusedError: A session of that id began with another configuration.
             EndedSessionError: The session of that id has ended.
         """
         digits = domain_digits(active.record.name)
@@ -137,20 +137,20 @@ class Sessions:
     ) -> SessionView:
         """Move a session on by a move and the view after it.
 
-        The stage `wait` is for its turn: behind what came before it, and then for the worker.
+        The stage `wait` of the watch is the wait behind earlier observations, and then for the worker.
 
         Raises:
             UnknownSessionError, EndedSessionError, RetiredMapError: There is no such session, or no more.
-            InvalidInputError: The move, the view or the shortlist cannot be.
+            InvalidInputError: The move, the view or the shortlist does not fit the map.
             LandmarkModelDiffersError: The view was ranked by another landmark model than that of the session's map.
-            IdempotencyKeyReusedError: The key named another observation.
-            SessionMovedError: Another node counted another observation this moment.
+            IdempotencyKeyReusedError: Its idempotency key came before with another observation.
+            SessionMovedError: Another node counted another observation at this moment.
         """
         live, watch = await self._find(session_id, key_id), watch or Stopwatch()
         try:
             return await self._finished(self._observe(live, observation, watch))
         except SessionMovedError:
-            live = await self._find(session_id, key_id)  # with what another node has written
+            live = await self._find(session_id, key_id)  # reads what another node has written
             number, idempotency = live.record.number, observation.idempotency
             if (
                 idempotency is None
@@ -167,7 +167,7 @@ class Sessions:
         return await self._finished(self._set_prior(live, position_m, std_m))
 
     async def view(self, session_id: str, n_shortlist: int | None = None, key_id: str | None = None) -> SessionView:
-        """What a session believes now."""
+        """A session as it stands now."""
         live, state = await self._read(session_id, key_id)
         return await asyncio.wrap_future(self._summaries.submit(view_of, live, live.expires_at, state, n_shortlist))
 
@@ -176,16 +176,16 @@ class Sessions:
         _, state = await self._read(session_id, key_id)
         return await asyncio.wrap_future(self._worker.submit(lambda: state.belief.belief.mass))
 
-    async def newest(self, domain: str | None, before: int | None, limit: int) -> ListPage[ListedSession, int]:
-        """A page of the living sessions, of a domain or all, newest first, behind number `before`."""
-        return await asyncio.to_thread(self._store.newest_living, domain, before, limit, self._clock())
+    async def newest(self, domain: str | None, before_number: int | None, limit: int) -> ListPage[ListedSession, int]:
+        """A page of the living sessions, of a domain or all, newest first, with numbers below `before_number`."""
+        return await asyncio.to_thread(self._store.newest_living, domain, before_number, limit, self._clock())
 
     async def end(self, session_id: str, key_id: str | None = None) -> None:
         """End a session."""
         await self._finished(self._end(await self._find(session_id, key_id), DELETED))
 
     async def end_those(self, is_over: Callable[[SessionRecord], bool]) -> None:
-        """End the living sessions that something is over for: their domain was deleted, say."""
+        """End the living sessions for which `is_over` holds, as those of a deleted domain."""
         for live in list(self._living.values()):
             if live.ending is None and is_over(live.record):
                 with suppress(EndedSessionError):  # its robot was quicker
@@ -198,18 +198,18 @@ class Sessions:
             pass
 
     def engine_of(self, record: SessionRecord) -> SessionEngine:
-        """What moves a session on, whether it lives or has ended; may read files.
+        """The engine of a session, living or ended; may read files.
 
         Raises:
             RetiredMapError: Its map is no more.
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
-        mapped = self._maps.pinned(record.domain, record.map_version, record.map_sha256)
+        mapped_domain = self._maps.pinned(record.domain, record.map_version, record.map_sha256)
         try:
             config = SessionConfig.from_dict(record.config)
         except (KeyError, TypeError, ValueError) as error:
             raise DamagedFileError(f"session {record.session_id} cannot be read: {error}") from error
-        return SessionEngine(config, mapped.snapshot, self._evaluators.evaluator(mapped.record.evaluator))
+        return SessionEngine(config, mapped_domain.snapshot, self._evaluators.evaluator(mapped_domain.record.evaluator))
 
     # Beginning
 
@@ -230,35 +230,35 @@ class Sessions:
             crowd = self._crowd(key_id, await self._holders())
         if crowd is not None:
             raise crowd
-        self._beginning[key_id] += 1
+        self._n_beginning[key_id] += 1
         try:
             snapshot = active.snapshot
             with self._maps.beginning(snapshot):
                 digest = await asyncio.to_thread(self._maps.digest, snapshot)
                 engine = SessionEngine(config, snapshot, self._evaluators.evaluator(active.record.evaluator))
                 state = await asyncio.wrap_future(self._worker.submit(lambda: SessionState.start(engine)))
-                now = self._clock()
-                new = SessionRecord(
+                now_s = self._clock()
+                new_record = SessionRecord(
                     number=0,
                     session_id=session_id,
                     domain=snapshot.domain,
                     map_version=snapshot.version,
                     map_sha256=digest,
                     config=config.as_dict(),
-                    created_at=now,
-                    expires_at=now + self._ttl_s,
+                    created_at=now_s,
+                    expires_at=now_s + self._ttl_s,
                     n_events=0,
                     ending=None,
                     key_id=key_id,
                 )
-                record = await asyncio.wrap_future(self._store.create(new))
-            if replace(record, number=0) != new:  # the same request was on its way twice, and the other was quicker
+                record = await asyncio.wrap_future(self._store.create(new_record))
+            if replace(record, number=0) != new_record:  # the same request came twice at once, and the other was first
                 return await self._begun_before(session_id, config)
             # A repetition may have found it on the disk already.
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at, state))
             return await asyncio.wrap_future(self._summaries.submit(view_of, live, record.expires_at, state))
         finally:
-            self._beginning[key_id] -= 1
+            self._n_beginning[key_id] -= 1
 
     async def _holders(self, *, may_have_ended: bool = False) -> list[str | None]:
         """The API key of every session that lives, wherever it does; see `SessionStore.holders`."""
@@ -267,20 +267,20 @@ class Sessions:
         return [live.record.key_id for live in self._living.values()]
 
     def _crowd(self, key_id: str | None, holders: Sequence[str | None]) -> TooManySessionsError | None:
-        """What is said where as many sessions live as may, of all or of one key."""
+        """The error where no further session may live, of all or of this key; None where one may."""
         rivals = list(self._living.values())
-        limit, most, whose = "max_sessions", self._max_sessions, "sessions"
-        if len(holders) + self._beginning.total() < most:
+        setting, limit, whose = "max_sessions", self._max_sessions, "sessions"
+        if len(holders) + self._n_beginning.total() < limit:
             if key_id is None:
                 return None
             rivals = [live for live in rivals if live.record.key_id == key_id]
-            limit, most, whose = "max_sessions_per_key", self._max_sessions_per_key, "sessions of this key"
-            if holders.count(key_id) + self._beginning[key_id] < most:
+            setting, limit, whose = "max_sessions_per_key", self._max_sessions_per_key, "sessions of this key"
+            if holders.count(key_id) + self._n_beginning[key_id] < limit:
                 return None
         soonest_s = min((live.expires_at for live in rivals), default=0.0) - self._clock()
-        hints = {limit: most, "limit": limit, "retry_after_s": max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s)))}
+        hints = {setting: limit, "limit": setting, "retry_after_s": max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s)))}
         return TooManySessionsError(
-            f"{most} {whose} live, and no more may: delete one that is done with, or wait", **hints
+            f"{limit} {whose} live, and no more may: delete one that is done with, or wait", **hints
         )
 
     # Finding
@@ -297,7 +297,7 @@ class Sessions:
             record = await asyncio.to_thread(self._store.find, session_id)
             check_owner(record, key_id)
             if record.ending is not None:
-                raise _ended(session_id, record.ending)
+                raise _ended_error(session_id, record.ending)
             live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
         if key_id is not None:
             check_owner(live.record, key_id)
@@ -307,11 +307,11 @@ class Sessions:
         if self._clock() >= live.expires_at and not live.lock.locked():
             await self._end(live, EXPIRED)
         if live.ending is not None:
-            raise _ended(session_id, live.ending)
+            raise _ended_error(session_id, live.ending)
         return live
 
     def _heed(self, live: LiveSession, record: SessionRecord) -> None:
-        """Forget what was believed of a session that another node has moved on or ended."""
+        """Drop the state of a session that another node has moved on or ended, by its row in the store."""
         live.expires_at = record.expires_at
         if live.state is not None and live.state.sequence != record.n_events:
             live.state = None
@@ -327,7 +327,7 @@ class Sessions:
         return live, live.state
 
     async def _state(self, live: LiveSession) -> SessionState:
-        """What a session answers from, read from the disk where need be; the caller holds the session's lock.
+        """The state of a session, read from the disk where it is not in memory; the caller holds the session's lock.
 
         Raises:
             EndedSessionError: It ended while the caller waited.
@@ -335,7 +335,7 @@ class Sessions:
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
         if live.ending is not None:
-            raise _ended(live.record.session_id, live.ending)
+            raise _ended_error(live.record.session_id, live.ending)
         if live.state is None:
             live.state = await asyncio.to_thread(self._from_disk, live.record)
         return live.state
@@ -351,11 +351,11 @@ class Sessions:
     # Moving on
 
     async def _observe(self, live: LiveSession, observation: Observation, watch: Stopwatch) -> SessionView:
-        """Everything in order under the session's lock: decode, describe, compute, write, publish."""
+        """Decode, describe, compute, write and publish, in this order and under the session's lock."""
         async with live.lock:
             state = live.state or await self._state(live)
             engine = state.engine
-            observation.check(engine.snapshot)  # a bad one should not move the session
+            observation.check(engine.snapshot)
             watch.lap("wait")
             view, remarks = await observation.view(engine.evaluator, engine.snapshot)
             watch.lap("decode")
@@ -366,8 +366,8 @@ class Sessions:
                 answer = await self._published(
                     live, step, watch, is_short=is_short(engine.snapshot, view, observation.n_shortlist)
                 )
-            except _CountedBefore as before:
-                answer = await self._repeated(live, state, before.sequence, observation.n_shortlist)
+            except _CountedBefore as repetition:
+                answer = await self._repeated(live, state, repetition.sequence, observation.n_shortlist)
                 watch.lap("summarise")
             return replace(answer, remarks=remarks) if remarks else answer
 
@@ -380,7 +380,7 @@ class Sessions:
         watch: Stopwatch,
         view: View,
     ) -> "_Move":
-        """Move on by the next row; raises _CountedBefore."""
+        """Move the session on by the observation's row; raises _CountedBefore where it has one already."""
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         idempotency, snapshot = observation.idempotency, state.engine.snapshot
         if idempotency is not None:
@@ -396,73 +396,74 @@ class Sessions:
         query = describe(snapshot, state.engine.evaluator, view)
         watch.lap("describe")
         relevance = snapshot.relevance
-        encoding = query.encoding if relevance in _ENCODED else None
+        encoding = query.encoding if relevance in _ENCODING_RELEVANCES else None
+        has_dissimilarities = encoding is None and relevance in _DISSIMILARITY_RELEVANCES
         row = ObservedRow(  # what the map's relevance compares, and no more
             sequence=state.sequence + 1,
             expires_at=expires_at,
             action_m=observation.action_m,
             action_std_m=observation.action_std_m,
             ranks=query.ranks,
-            dissimilarities=query.dissimilarities if relevance in _MEASURED and encoding is None else None,
+            dissimilarities=query.dissimilarities if has_dissimilarities else None,
             encoding=encoding,
             idempotency=observation.idempotency,
         )
         return self._move_on(live, state, row, observation.n_shortlist, watch)
 
     def _move_on(
-        self, live: LiveSession, before: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
+        self, live: LiveSession, previous: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
     ) -> "_Move":
-        """The state after a row, which is on its way to the disk while the answer is summed up."""
-        after = before.after(row)
-        if after.step is not None:
-            watch.lap("plan", after.step.timings_ms)
+        """The state after a row, which is written while the answer is summed up."""
+        state = previous.next_state(row)
+        if state.step is not None:
+            watch.lap("plan", state.step.timings_ms)
         snapshot = None
-        if before.sequence > 0 and before.sequence % self._snapshot_every == 0:
+        if previous.sequence > 0 and previous.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
-            snapshot = before.snapshot()
-        written = self._store.append(live.record.number, row, self._clock(), snapshot)
+            snapshot = previous.snapshot()
+        commit = self._store.append(live.record.number, row, self._clock(), snapshot)
         try:
-            answer = view_of(live, row.expires_at, after, n_shortlist)
+            answer = view_of(live, row.expires_at, state, n_shortlist)
         except Exception as error:
-            raise _NotSummedUp(written) from error
+            raise _NotSummedUp(commit) from error
         watch.lap("summarise")
-        return _Move(after, answer, written)
+        return _Move(state, answer, commit)
 
     async def _published(
         self, live: LiveSession, move_on: "Callable[[], _Move]", watch: Stopwatch, *, is_short: bool = False
     ) -> SessionView:
-        """Move a session on; its answer, once that is on the disk."""
+        """Move a session on by `move_on`; its answer, once the move is on the disk."""
         is_written = False
         try:
             move = await self._worker.computed(move_on, is_short=is_short)
             is_written = True
-            await asyncio.wrap_future(move.written)
+            await asyncio.wrap_future(move.commit)
         except _NotSummedUp as failed:
             live.state = None
-            await asyncio.wrap_future(failed.written)  # the row counts, and is there when the session is read again
+            await asyncio.wrap_future(failed.commit)  # the row counts, and is there when the session is read again
             raise
         except BaseException as error:
             if is_written or not isinstance(error, DeepSimbadError | _CountedBefore):
                 live.state = None  # what the file holds is the truth: it is read again at the next touch
             raise
-        live.expires_at, live.state = move.answer.expires_at, move.after
+        live.expires_at, live.state = move.answer.expires_at, move.state
         watch.lap("commit")
         return move.answer
 
     async def _repeated(
         self, live: LiveSession, state: SessionState, sequence: int, n_shortlist: int | None
     ) -> SessionView:
-        """The answer that an observation had; computed again, since the same journal leads to the same belief."""
+        """The answer to an observation counted before, computed again: the same journal leads to the same belief."""
         if state.sequence != sequence:
             async with self._repeating:  # a replay is long: many of them take turns
-                before = await asyncio.to_thread(self._store.snapshot_before, live.record.number, sequence)
+                snapshot = await asyncio.to_thread(self._store.snapshot_before, live.record.number, sequence)
                 state = await replayed_until(
                     self._store,
                     self._worker,
                     live.record,
                     state.engine,
                     lambda row, _: row.sequence == sequence,
-                    before,
+                    snapshot,
                 )
         answer = await asyncio.wrap_future(self._summaries.submit(view_of, live, live.expires_at, state, n_shortlist))
         return replace(answer, is_repeated=True)
@@ -478,10 +479,10 @@ class Sessions:
     # Ending
 
     async def _end(self, live: LiveSession, ending: str) -> None:
-        """End a session, once what it is doing is done; raises EndedSessionError where it had ended before."""
+        """End a session after the change under way; raises EndedSessionError where it had ended before."""
         async with live.lock:
             if live.ending is not None:
-                raise _ended(live.record.session_id, live.ending)
+                raise _ended_error(live.record.session_id, live.ending)
             await asyncio.wrap_future(self._store.end(live.record.number, ending, self._clock()))
             self._heed(live, await asyncio.to_thread(self._store.find, live.record.session_id))
 
@@ -510,25 +511,25 @@ class _CountedBefore(Exception):  # noqa: N818 - nobody's error
 class _NotSummedUp(RuntimeError):  # noqa: N818 - as `_CountedBefore`
     """A session that moved cannot be summed up."""
 
-    def __init__(self, written: Future[None]) -> None:
+    def __init__(self, commit: Future[None]) -> None:
         super().__init__("a session that moved cannot be summed up")
-        self.written = written  # done when the move is on the disk
+        self.commit = commit  # done when the row is on the disk
 
 
 @dataclass(frozen=True)
 class _Move:
-    """A session moved on, but for the disk."""
+    """A session moved on, whose row may still be on its way to the disk."""
 
-    after: SessionState
+    state: SessionState
     answer: SessionView
-    written: Future[None]  # done when it is on the disk
+    commit: Future[None]  # done when the row is on the disk
 
 
 def check_owner(record: SessionRecord, key_id: str | None) -> None:
-    """Deny a session to every key but its own, where it has one; raises UnknownSessionError. No key may know of all."""
+    """Deny a session that has a key to every other key; raises UnknownSessionError. Without a key all are allowed."""
     if key_id is not None and record.key_id not in {None, key_id}:
         raise UnknownSessionError(f"there is no session {record.session_id!a}")
 
 
-def _ended(session_id: str, ending: str) -> EndedSessionError:
+def _ended_error(session_id: str, ending: str) -> EndedSessionError:
     return EndedSessionError(f"session {session_id} has ended ({ending}): begin a new one", ending=ending)

@@ -1,7 +1,7 @@
 """Traverse files kept open while frames arrive: opening and closing one costs many times what a frame does.
 
-And how many pictures may wait in them to be fitted; and batches of frames, read with distrust: what one declares is
-judged before anything of it is unpacked.
+Here too: the room for pictures that wait to be fitted, and the reading of batches of frames, whose declared sizes are
+checked before anything is unpacked.
 """
 
 import math
@@ -31,7 +31,7 @@ class _Loan:
 
 
 class OpenTraverses:
-    """Lends open traverses; one that is not to be lent again is closed after its last use."""
+    """Lends open traverses; a traverse that was dropped is closed after its last use."""
 
     def __init__(self, data_dir: Path) -> None:
         self._data_dir = data_dir
@@ -40,7 +40,7 @@ class OpenTraverses:
 
     @contextmanager
     def lend(self, domain: str, name: str) -> Iterator[Traverse]:
-        """A traverse for the length of the block; several blocks may hold it at once; raises UnknownTraverseError."""
+        """An open traverse inside the block, shared with other blocks; raises UnknownTraverseError."""
         key = domain, name
         with self._lock:
             if key in self._open:
@@ -53,8 +53,8 @@ class OpenTraverses:
             self._open.move_to_end(key)
             loan = self._open[key]
             loan.n_users += 1
-            idle = [other for other in self._open if not self._open[other].n_users]
-            for oldest in idle[: max(0, len(self._open) - MAX_IDLE)]:
+            idle_keys = [other for other in self._open if not self._open[other].n_users]
+            for oldest in idle_keys[: max(0, len(self._open) - MAX_IDLE)]:
                 self._drop(oldest)
         try:
             yield loan.traverse
@@ -93,35 +93,36 @@ class SpoolRoom:
 
     def __init__(self, data_dir: Path, max_bytes: int) -> None:
         self._data_dir, self._max_bytes = data_dir, max_bytes
-        self._used: dict[str, int] = {}  # at least as much as there is: jobs empty spools in processes of their own
+        # By domain, at least as many as there are: jobs empty spools in processes of their own
+        self._spooled_bytes: dict[str, int] = {}
         self._lock = threading.Lock()
 
     def make_room(self, domain: str, n_bytes: int) -> None:
         """Count a picture that is about to wait; raises SpoolFullError, and the traverse stays as it is."""
         with self._lock:
-            waiting: dict[str, int] = {}
-            if domain not in self._used or self._used[domain] + n_bytes > self._max_bytes:
+            spooled_bytes: dict[str, int] = {}
+            if domain not in self._spooled_bytes or self._spooled_bytes[domain] + n_bytes > self._max_bytes:
                 for name in Traverse.list(self._data_dir, domain):
                     with suppress(UnknownTraverseError), Traverse.open(self._data_dir, domain, name) as traverse:
-                        waiting[name] = traverse.spooled_bytes
-                self._used[domain] = sum(waiting.values())
-            if self._used[domain] + n_bytes > self._max_bytes:
-                fullest = max(waiting, key=lambda name: waiting[name])
+                        spooled_bytes[name] = traverse.spooled_bytes
+                self._spooled_bytes[domain] = sum(spooled_bytes.values())
+            if self._spooled_bytes[domain] + n_bytes > self._max_bytes:
+                fullest = max(spooled_bytes, key=lambda name: spooled_bytes[name])
                 raise SpoolFullError(
-                    f"{self._used[domain]} bytes of images wait in domain {domain} for its evaluator to be fitted, and "
-                    f"{self._max_bytes} are the most: remap with the traverse that holds most of them, {fullest}, or "
-                    "delete it, or raise the setting max_spool_bytes; the frame was not stored",
+                    f"{self._spooled_bytes[domain]} bytes of images wait in domain {domain} for its evaluator to be "
+                    f"fitted, and {self._max_bytes} are the most: remap with the traverse that holds most of them, "
+                    f"{fullest}, or delete it, or raise the setting max_spool_bytes; the frame was not stored",
                     limit="max_spool_bytes",
                     max_spool_bytes=self._max_bytes,
-                    spooled_bytes=self._used[domain],
+                    spooled_bytes=self._spooled_bytes[domain],
                     traverse=fullest,
                 )
-            self._used[domain] += n_bytes
+            self._spooled_bytes[domain] += n_bytes
 
 
 MEMBERS = {"encodings": 2, "index": 1, "position_m": 1, "timestamp_us": 1, "x_m": 1, "y_m": 1, "name": 1}
 """Arrays that a batch may hold, and how many dimensions each has."""
-REQUIRED = ("encodings", "index", "position_m")
+REQUIRED_ARRAYS = ("encodings", "index", "position_m")
 _KINDS = {"encodings": "f", "position_m": "fiu", "x_m": "fiu", "y_m": "fiu", "name": "U"}  # numpy's; else "iu"
 _KIND_WORDS = {"f": "floats", "U": "texts"}
 _END_OF_DIRECTORY, _LARGE_DIRECTORY = b"PK\x05\x06", b"PK\x06\x07"
@@ -163,14 +164,14 @@ def _check_directory(file: IO[bytes]) -> None:
 def _arrays(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, Any]:
     members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
     if not set(members) <= set(MEMBERS) or len(members) != len(archive.infolist()):
-        what = f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}"
-        raise InvalidBatchError(what, allowed=list(MEMBERS))
-    if missing := [name for name in REQUIRED if name not in members]:
+        message = f"the batch holds arrays that are not known or stand twice; known are {', '.join(MEMBERS)}"
+        raise InvalidBatchError(message, allowed=list(MEMBERS))
+    if missing := [name for name in REQUIRED_ARRAYS if name not in members]:
         raise InvalidBatchError(f"the batch lacks {', '.join(missing)}", missing=missing)
     n_bytes = sum(member.file_size for member in members.values())
     if n_bytes > max_bytes:
-        what = f"the batch unpacks to {n_bytes} bytes; at most {max_bytes} are taken, send fewer frames at once"
-        raise TooLargeError(what, max_bytes=max_bytes)
+        message = f"the batch unpacks to {n_bytes} bytes; at most {max_bytes} are taken, send fewer frames at once"
+        raise TooLargeError(message, max_bytes=max_bytes)
     arrays = {}
     for name, member in members.items():
         with archive.open(member) as stream:
@@ -187,8 +188,8 @@ def _check_header(name: str, stream: IO[bytes], n_bytes: int) -> None:
     version = np.lib.format.read_magic(stream)
     if version not in {(1, 0), (2, 0)}:
         raise InvalidBatchError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream, max_header_size=_MAX_HEADER_BYTES)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(stream, max_header_size=_MAX_HEADER_BYTES)
     kinds = _KINDS.get(name, "iu")
     if dtype.kind not in kinds or dtype.itemsize > (4 * MAX_NAME_LENGTH if dtype.kind == "U" else 8):
         raise InvalidBatchError(f"{name} holds {dtype}; it must hold {_KIND_WORDS.get(kinds[0], 'integers')}")

@@ -1,4 +1,4 @@
-"""How well a session knew where its robot was, told once the truth is known: the alarm that a season has turned."""
+"""How well a session knew where its robot was, ranked once the truth is known: the alarm that a season has turned."""
 
 import asyncio
 import math
@@ -19,7 +19,7 @@ from deepsimbad.errors import InvalidInputError
 from deepsimbad.store.sessions import JournalRow, ObservedRow, SessionRecord, SessionStore, StateSnapshot
 
 _FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
-_RESUMABLE = 16  # sessions, 0.5 MB each at 26,000 map images
+_MOST_RESUMABLE = 16  # sessions, 0.5 MB each at 26,000 map images
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class RankedTruths:
     # [n_observations] share of the map images that the belief placed before the true one, 0..1; NaN where the truth is
     # unknown, or farther than 10 m from the map
     rank_share: NDArray[np.float64]
-    # [n_observations] rank from 0 of the best-placed true image by each view's own relevance; NaN where no true image
-    # was told; None where none was of any view
+    # [n_observations] rank from 0 of the best-placed true image by each view's own relevance; NaN where an observation
+    # has no true image; None where none has
     retrieval_rank: NDArray[np.float64] | None = None
-    first: int = 0  # observation that was told of
+    first: int = 0  # observation whose truth was posted
 
     @property
     def n_scored(self) -> int:
@@ -43,7 +43,7 @@ class RankedTruths:
 
     @property
     def n_left_out(self) -> int:
-        """Observations told of whose truth is unknown, or is no place of the map."""
+        """Observations from `first` on whose truth is unknown, or is no place of the map."""
         return int(self.rank_share.size) - self.first - self.n_scored
 
     @property
@@ -52,10 +52,10 @@ class RankedTruths:
         return 100 * float(np.nanmean(self.rank_share)) if self.n_scored else None
 
     def new_since(self, before_m: NDArray[np.float64] | None) -> NDArray[np.float64]:
-        """The rank shares of those observations whose truth had not been told before.
+        """[m] the rank shares of the observations whose truth was not known before.
 
         Args:
-            before_m: What had been told: positions of the first so many observations, NaN where unknown; None: nothing.
+            before_m: Truths known before, of the first observations: [k] positions, NaN where unknown; None: none.
         """
         is_new = ~np.isnan(self.rank_share)
         if before_m is not None:
@@ -64,10 +64,10 @@ class RankedTruths:
 
 
 def checked_truths(positions_m: Sequence[float | None], n_observations: int, first: int = 0) -> NDArray[np.float64]:
-    """[n_observations] true positions along the route, NaN where unknown, as before the first one told of.
+    """[n_observations] true positions along the route, NaN where unknown and for the observations before `first`.
 
     Raises:
-        InvalidInputError: As many positions as observations there are not, or one is not finite.
+        InvalidInputError: There are not as many positions as observations from `first` on, or one is not finite.
     """
     if any(position_m is not None and not math.isfinite(position_m) for position_m in positions_m):
         raise InvalidInputError("a true position is NaN or infinite; give null where it is unknown")
@@ -90,7 +90,8 @@ class Truths:
         self._worker = worker
         self._sessions = sessions
         self._clock = clock
-        self._reached: dict[int, tuple[int, StateSnapshot]] = {}  # how far, by session: truths come bit by bit
+        # By session, the number of observations ranked last and the state after them: truths come bit by bit
+        self._resume_points: dict[int, tuple[int, StateSnapshot]] = {}
 
     async def rank(
         self,
@@ -100,32 +101,33 @@ class Truths:
         first: int = 0,
         key_id: str | None = None,
     ) -> RankedTruths:
-        """Rank the truth in the belief, and where asked in the retrieval, as it was after every observation.
+        """Rank the truth in the belief, and with `true_map_images` in the retrieval, as it was after every observation.
 
         In the belief the true map image is the one nearest to the true position along the route; ranks follow ANR's
-        rule. Truths told bit by bit, in order, cost no more than told at once.
+        rule. Truths that come in pieces, in order, cost no more than all at once.
 
         Args:
             session_id: The session.
-            positions_m: One for every observation; None where it is unknown.
-            true_map_images: For every observation the map images that show its place.
-            first: The observation that the first of them belongs to.
+            positions_m: One for every observation from `first` on; None where it is unknown.
+            true_map_images: For each of these observations the map images that show its place.
+            first: The observation that the first of the positions belongs to.
             key_id: The API key whose sessions alone are known to the asker; None: all are.
 
         Raises:
             UnknownSessionError: There is none such, or it ended long ago.
             RetiredMapError: Its map is no more.
-            InvalidInputError: As many as observations there are not, a position is not finite, or no map image is one.
+            InvalidInputError: There are not as many positions or lists as observations from `first` on, a position is
+                not finite, or a list holds what is no map image.
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
 
-        def prepared() -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
+        def prepare() -> tuple[SessionRecord, SessionEngine, NDArray[np.float64]]:
             record = self._store.find(session_id)
             check_owner(record, key_id)
             truth_m = checked_truths(positions_m, self._store.n_observations(record.number), first)
             return record, self._sessions.engine_of(record), truth_m
 
-        record, engine, truth_m = await asyncio.to_thread(prepared)
+        record, engine, truth_m = await asyncio.to_thread(prepare)
         route = engine.snapshot.route
         images = _checked_images(true_map_images, truth_m.size, first, route.n_images)
         nearest = true_images(route, truth_m)
@@ -158,9 +160,9 @@ class Truths:
         Returns:
             The ranked truths, and the positions that had been kept before, if any.
         """
-        ranked = await self.rank(session_id, positions_m, true_map_images, first, key_id)
-        before = self._store.save_true_positions(ranked.session.number, ranked.position_m, self._clock())
-        return ranked, await asyncio.wrap_future(before)
+        ranking = await self.rank(session_id, positions_m, true_map_images, first, key_id)
+        previous = self._store.save_true_positions(ranking.session.number, ranking.position_m, self._clock())
+        return ranking, await asyncio.wrap_future(previous)
 
     async def _follow(
         self,
@@ -170,7 +172,7 @@ class Truths:
         last: int,
         rank: Callable[[int, LocalizerState], None],
     ) -> None:
-        """Tell `rank` of the state after every observation from one to another."""
+        """Call `rank` with the number and the state of every observation from `first` to `last`."""
 
         def is_last(row: JournalRow, state: SessionState) -> bool:
             number = state.belief.n_observations - 1
@@ -178,32 +180,34 @@ class Truths:
                 rank(number, state.belief)
             return number == last
 
-        n_before, snapshot = self._reached.pop(record.number, (0, None))
+        n_before, snapshot = self._resume_points.pop(record.number, (0, None))
         state = await replayed_until(
             self._store, self._worker, record, engine, is_last, snapshot if n_before <= first else None
         )
-        self._reached[record.number] = state.belief.n_observations, state.snapshot()
-        while len(self._reached) > _RESUMABLE:
-            del self._reached[next(iter(self._reached))]
+        self._resume_points[record.number] = state.belief.n_observations, state.snapshot()
+        while len(self._resume_points) > _MOST_RESUMABLE:
+            del self._resume_points[next(iter(self._resume_points))]
 
 
 def _checked_images(
     true_map_images: Sequence[Sequence[int]] | None, n_observations: int, first: int, n_images: int
 ) -> dict[int, NDArray[np.int64]]:
-    """The map images that show the place of an observation, by its number, of those that have any.
+    """The map images that show the place of each observation, by its number; without those that have none.
 
     Raises:
-        InvalidInputError: As many lists as positions there are not, or one holds what is no map image.
+        InvalidInputError: There are not as many lists as observations, or a list holds what is no map image.
     """
     if true_map_images is not None and first + len(true_map_images) != n_observations:
         raise InvalidInputError(f"{len(true_map_images)} lists of true map images: give one for each true position")
     if any(not 0 <= image < n_images for images in true_map_images or () for image in images):
         raise InvalidInputError(f"map images are 0 to {n_images - 1}", minimum=0, maximum=n_images - 1)
-    listed = enumerate(true_map_images or (), first)
-    return {number: np.array(images, np.int64) for number, images in listed if images}
+    return {number: np.array(images, np.int64) for number, images in enumerate(true_map_images or (), first) if images}
 
 
 def true_images(route: Route, position_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """[n] the map image nearest to each position, on a closed route any number of rounds on; where unknown any."""
+    """[n] int64: the map image nearest to each position [n], NaN where unknown, which gives any image.
+
+    On a closed route a position may be any number of rounds on.
+    """
     somewhere_m = np.where(np.isnan(position_m), route.start_m, position_m)
     return route.nearest_image(route.wrapped(somewhere_m)).astype(np.int64)

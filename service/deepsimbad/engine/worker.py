@@ -39,7 +39,7 @@ _failures: WeakKeyDictionary[Evaluator, tuple[float, InvalidInputError]] = WeakK
 
 
 class EvaluatorPool:
-    """Evaluators by configuration, made at first need: one copy of a network, whoever uses it."""
+    """Evaluators by configuration, made at first need, so that there is one copy of each network."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class EvaluatorPool:
         """The evaluator of a configuration, loaded or not: ranked landmarks and ready encodings need no network.
 
         Raises:
-            InvalidInputError: There is none of that kind or name.
+            InvalidInputError: There is no evaluator of that kind or name.
         """
         config = evaluator_config(raw_config)
         key = json.dumps(config.as_dict(), sort_keys=True)
@@ -65,7 +65,7 @@ class EvaluatorPool:
             return self._evaluators[key]
 
     def load_all(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
-        """Load the evaluators of all domains, by their names; one that cannot be keeps no other from serving."""
+        """Load the evaluators of domains, by domain; one that cannot be loaded is logged and holds up no other."""
         for domain, raw_config in configs.items():
             try:
                 self.evaluator(raw_config).load()
@@ -74,7 +74,7 @@ class EvaluatorPool:
 
 
 def ready(evaluator: Evaluator) -> Evaluator:
-    """The evaluator of a domain that exists, loaded; the first time that takes a moment.
+    """The evaluator of an existing domain, loaded, which takes a moment the first time.
 
     Raises:
         EvaluatorUnavailableError: It cannot be loaded, or could not some seconds ago; no robot's view is at fault.
@@ -100,29 +100,29 @@ class EncodedImage:
     """An image that the domain's evaluator has encoded."""
 
     values: NDArray[np.float32]  # [d]
-    weights_sha256: str | None  # of the network that did; None where none did
-    encode_ms: float  # how long it took, with those of the same batch
+    weights_sha256: str | None  # of the network that encoded it; None where there is none
+    encode_ms: float  # time that its whole batch took
 
 
 def encode_images(evaluator: Evaluator, images: Sequence[Image | Scene]) -> list[EncodedImage]:
-    """Encode images at once.
+    """Encode images as one batch.
 
     Raises:
         UnsupportedMediaTypeError: The evaluator takes ready encodings alone.
-        OutOfMemoryError: There is too little memory for it.
+        OutOfMemoryError: There is too little memory for the batch.
         EvaluatorUnavailableError: Its network gives something else than encodings.
     """
-    began = perf_counter()
+    start_s = perf_counter()
     try:
         encodings = evaluator.encode(images)
     except InvalidWeightsError as error:  # the network is at fault, not what a robot sent
         raise EvaluatorUnavailableError(error.message, reason=error.code, **error.hints) from error
-    encode_ms = 1000 * (perf_counter() - began)
+    encode_ms = 1000 * (perf_counter() - start_s)
     return [EncodedImage(encoding, evaluator.weights_sha256, encode_ms) for encoding in encodings]
 
 
 class Priority(IntEnum):
-    """Who goes first; within one priority, in order of arrival."""
+    """Order of work, least first; within one priority it is done in order of arrival."""
 
     LIVE = 0
     BATCH = 1
@@ -140,28 +140,28 @@ class _Work:
 
 
 class _Line:
-    """A thread that does what waits in line, live work first, each in order of arrival."""
+    """A thread with its line of work: live work first, each priority in order of arrival."""
 
     def __init__(self, name: str, max_waiting: int | None) -> None:
         self._max_waiting = max_waiting
         self._n_waiting = dict.fromkeys(Priority, 0)
         self._queue: PriorityQueue[_Work] = PriorityQueue()
         self._arrivals = itertools.count()
-        self._open = True
+        self._is_open = True
         self._lock = threading.Lock()
         self.thread = threading.Thread(target=self._work, name=name, daemon=True)
         self.thread.start()
 
     @property
     def n_waiting(self) -> int:
-        """How much waits."""
+        """How many pieces of work wait."""
         return self._queue.qsize()
 
-    def join(self, priority: Priority, **what: Any) -> Future[Any]:
-        """Stand in line; raises UnavailableError and OverloadedError."""
-        work = _Work(priority, next(self._arrivals), **what)
+    def join(self, priority: Priority, **fields: Any) -> Future[Any]:
+        """Put work with these `fields` in line; raises UnavailableError and OverloadedError."""
+        work = _Work(priority, next(self._arrivals), **fields)
         with self._lock:
-            if not self._open:
+            if not self._is_open:
                 raise UnavailableError("the service is shutting down")
             if self._max_waiting is not None and self._n_waiting[priority] >= self._max_waiting:
                 raise OverloadedError(
@@ -174,29 +174,29 @@ class _Line:
     def close(self) -> None:
         """Finish what is in line, then end the thread."""
         with self._lock:
-            if not self._open:
+            if not self._is_open:
                 return
-            self._open = False
+            self._is_open = False
             self._queue.put(_Work(Priority._CLOSE, next(self._arrivals)))
         self.thread.join()
 
     def _work(self) -> None:
         while (first := self._queue.get()).priority is not Priority._CLOSE:
-            some = self._with_company(first)
+            batch = self._with_company(first)
             del first
             with self._lock:
-                for work in some:
+                for work in batch:
                     self._n_waiting[work.priority] -= 1
-            self._do([work for work in some if work.answer.set_running_or_notify_cancel()])
-            del some, work  # or the last answer's arrays live until the next is asked for
+            self._do([work for work in batch if work.answer.set_running_or_notify_cancel()])
+            del batch, work  # or the last answer's arrays live until the next is asked for
 
     def _with_company(self, first: _Work) -> list[_Work]:
-        """Work, with what is done together with it, taken off the line."""
+        """Work taken off the line, with further work that is done together with it."""
         return [first]
 
-    def _do(self, some: list[_Work]) -> None:
-        """Give every one its answer."""
-        for work in some:
+    def _do(self, batch: list[_Work]) -> None:
+        """Do the work and set its answers."""
+        for work in batch:
             try:
                 result = work.run()
             except BaseException as error:
@@ -206,7 +206,7 @@ class _Line:
 
 
 class _EncodingLine(_Line):
-    """Images that wait are encoded together, where the machine gains by it."""
+    """A line of images, which are encoded together where the machine gains by it."""
 
     def __init__(self, name: str, max_waiting: int | None, longest_wait_s: float) -> None:
         self._longest_wait_s = longest_wait_s
@@ -214,36 +214,36 @@ class _EncodingLine(_Line):
 
     def _with_company(self, first: _Work) -> list[_Work]:
         assert first.evaluator is not None
-        some, until = [first], monotonic() + self._longest_wait_s
+        batch, deadline_s = [first], monotonic() + self._longest_wait_s
         try:
-            largest = first.evaluator.largest_batch
+            largest_batch = first.evaluator.largest_batch
         except Exception:  # its network cannot be loaded, which encoding it will tell
-            return some
-        while len(some) < largest:
-            left_s = until - monotonic()
+            return batch
+        while len(batch) < largest_batch:
+            left_s = deadline_s - monotonic()
             try:
-                following = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
+                next_work = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
             except Empty:
                 break
-            if following.evaluator is not first.evaluator:
-                self._queue.put(following)  # in its old place: the order is by priority and arrival
+            if next_work.evaluator is not first.evaluator:
+                self._queue.put(next_work)  # in its old place: the order is by priority and arrival
                 break
-            some.append(following)
-        return some
+            batch.append(next_work)
+        return batch
 
-    def _do(self, some: list[_Work]) -> None:
-        """Those that cannot be encoded fail, and alone."""
-        if not some:
+    def _do(self, batch: list[_Work]) -> None:
+        """Encode the batch; where that fails encode each alone, so that only those at fault fail."""
+        if not batch:
             return
-        assert some[0].evaluator is not None
+        assert batch[0].evaluator is not None
         try:
-            encoded = encode_images(some[0].evaluator, [work.view for work in some if work.view is not None])
-            answers = list(zip(some, encoded, strict=True))
+            encoded = encode_images(batch[0].evaluator, [work.view for work in batch if work.view is not None])
+            answers = list(zip(batch, encoded, strict=True))
         except BaseException as error:
-            if len(some) == 1:
-                some[0].answer.set_exception(error)
+            if len(batch) == 1:
+                batch[0].answer.set_exception(error)
                 return
-            for work in some:
+            for work in batch:
                 self._do([work])
             return
         for work, image in answers:
@@ -254,12 +254,12 @@ class InferenceWorker:
     """Encodes images in one thread and does long work in another, live work first.
 
     One thread each, because networks and long sums already use the cores they need: two at once would only make both
-    late. Long work of little hurry must be submitted in pieces that a live view can wait for. What is short belongs on
+    late. Long work that is not urgent must be submitted in pieces that a live view can wait for. Short work belongs on
     the event loop: to hand a millisecond of work to another thread costs as much again, since the two then wait for
     each other's hold of the interpreter.
 
     Args:
-        max_waiting: How much of one priority may wait for a thread; None: any number.
+        max_waiting: How many pieces of work of one priority may wait for a thread; None: any number.
         longest_wait_s: How long an image may wait for others to fill a batch, where one larger than 1 gains anything.
     """
 
@@ -274,29 +274,29 @@ class InferenceWorker:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the threads are there."""
+        """Whether the threads run."""
         return self._encoding.thread.is_alive() and self._long_work.thread.is_alive()
 
     def submit(self, run: Callable[[], T], priority: Priority = Priority.LIVE) -> Future[T]:
         """Queue a function.
 
         Returns:
-            Its result or error to come; cancelling it before it began takes it off the queue.
+            The future of its result; cancelling it before the function began takes it off the queue.
 
         Raises:
             UnavailableError: The worker has been closed.
-            OverloadedError: As many wait as may.
+            OverloadedError: The limit on waiting work is reached.
         """
         return self._long_work.join(priority, run=run)
 
     def encode(
         self, evaluator: Evaluator, view: Image | Scene, priority: Priority = Priority.LIVE
     ) -> Future[EncodedImage]:
-        """Queue an image or a scene to be encoded; as `submit`."""
+        """Queue an image or a scene to be encoded; returns and raises as `submit`."""
         return self._encoding.join(priority, evaluator=evaluator, view=view)
 
     async def computed(self, run: Callable[[], T], *, is_short: bool = False) -> T:
-        """The result of a function, which runs here and now where it is short."""
+        """The result of a function, which runs on the event loop where it is short, else on the worker."""
         return run() if is_short else await asyncio.wrap_future(self.submit(run))
 
     def close(self) -> None:
@@ -307,28 +307,28 @@ class InferenceWorker:
 
 @dataclass
 class Stopwatch:
-    """Where the time of one answer goes, from its making on: each lap names what was done since the one before.
+    """Times the stages of one answer, from its making on: each lap names the stage that ends with it.
 
-    An answer is in the hands of one thread at a time: laps follow each other, and their sum is never above the total.
+    One thread at a time works on an answer: laps follow each other, and their sum is never above the total.
     """
 
-    _began: float = field(default_factory=perf_counter)
-    _last: float = field(default_factory=perf_counter)
+    _start_s: float = field(default_factory=perf_counter)
+    _lap_s: float = field(default_factory=perf_counter)
     _spent_ms: dict[str, float] = field(default_factory=dict)
 
     def lap(self, stage: str, parts_ms: Mapping[str, float] | None = None) -> None:
-        """Count the time since the last lap to a stage, but that of parts, which were measured apart, to theirs."""
-        now, spent_ms = perf_counter(), self._spent_ms
-        left_ms = 1000 * (now - self._last)
+        """Count the time since the last lap for a stage, less that of parts, which are stages of their own."""
+        now_s, spent_ms = perf_counter(), self._spent_ms
+        left_ms = 1000 * (now_s - self._lap_s)
         for part, part_ms in (parts_ms or {}).items():
             spent_ms[part] = spent_ms.get(part, 0.0) + part_ms
             left_ms -= part_ms
         spent_ms[stage] = spent_ms.get(stage, 0.0) + max(0.0, left_ms)
-        self._last = now
+        self._lap_s = now_s
 
     def timings_ms(self) -> dict[str, float]:
         """Milliseconds by stage, and their `total` up to now."""
-        timings_ms = {**self._spent_ms, "total": 1000 * (perf_counter() - self._began)}
+        timings_ms = {**self._spent_ms, "total": 1000 * (perf_counter() - self._start_s)}
         for stage, spent_ms in timings_ms.items():
             timings_ms[stage] = round(spent_ms, 3)
         return timings_ms
