@@ -1,4 +1,4 @@
-"""Which of many maps a view is of (ours), for all of them at once.
+"""Which of many maps a view is of (ours), computed for all of them at once.
 
 Beliefs on different maps cannot be compared: each says where on its own route a robot is, if it is there. They have a
 common reference, by how much likelier a view is on a route than elsewhere,
@@ -6,11 +6,11 @@ common reference, by how much likelier a view is on a route than elsewhere,
     log evidence = A k (max_x r(x) - R) - B min(1, sqrt(d / 1000)) (s - S),
 
 with r(x) the relevance of map image x (`composed`: a cosine), k its scale as a log-likelihood, and s how strange the
-view, of d numbers, is to the route (`relevance.strangeness`). R and S are what views that are as likely to be from
-elsewhere have, and A and B how much more and less tell: learnt, with what comes of it, in docs/results/many-domains.md.
+view, of d numbers, is to the route (`relevance.strangeness`). R and S are those of views that are as likely to be from
+elsewhere, and A and B how much a difference from them tells; docs/results/many-domains.md says how they were learnt.
 
-Every domain is as probable as every other before the view, because whoever names domains asks which of these routes it
-is, not which of their metres or images; `elsewhere`, none of them, is as probable then as a robot is to be lost.
+Every domain is as probable as every other before the view, because the question is which of these routes it is of, not
+which of their metres or images; `elsewhere`, none of them, is then as probable as a robot is to be lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,15 +33,15 @@ from deepsimbad.errors import InvalidMapConfigError
 
 RELEVANCE_WEIGHT, USUAL_RELEVANCE = 0.74, 0.43  # A, R
 STRANGENESS_WEIGHT, USUAL_STRANGENESS = 34.0, 0.16  # B, S
-_SURE_NUMBERS = 1000.0  # of an encoding, from which on its strangeness is known well
+_SURE_NUMBERS = 1000.0  # length of an encoding from which on its strangeness counts in full
 _BLOCK = 2048  # images whose sums stay in the first-level cache
 _AT_ONCE = 64  # maps that a thread takes
 
 
 def log_evidence(map_: Map, query: Query) -> float:
-    """By how much likelier a view is on a `composed` map's route than elsewhere, as a natural logarithm.
+    """How much likelier a view is on a `composed` map's route than elsewhere, as a natural logarithm.
 
-    0 of a view that shows nothing; of one that came without its encoding relevance alone tells.
+    It is 0 of a view that shows nothing; of one without its encoding relevance alone counts.
 
     Raises:
         InvalidMapConfigError: The map's relevances have no meaning beside another map's.
@@ -51,31 +51,31 @@ def log_evidence(map_: Map, query: Query) -> float:
         raise InvalidMapConfigError(f"relevances of {map_.relevance} mean nothing beside another map's")
     if not query.is_informative:
         return 0.0
-    usual, strange = map_.live_statistics, None
-    if query.encoding is not None and usual is not None and usual.encodings is not None:
-        strange = np.array([strangeness(query.encoding, usual.encodings)])
-    greatest = np.array([relevances(map_, query).max()], np.float64)
+    statistics, far_share = map_.live_statistics, None
+    if query.encoding is not None and statistics is not None and statistics.encodings is not None:
+        far_share = np.array([strangeness(query.encoding, statistics.encodings)])
+    best_relevance = np.array([relevances(map_, query).max()], np.float64)
     d = 0 if query.encoding is None else query.encoding.size
-    return float(_weighed(greatest, np.array([map_.log_likelihood_scale]), strange, np.array([d]))[0])
+    return float(_weighed(best_relevance, np.array([map_.log_likelihood_scale]), far_share, np.array([d]))[0])
 
 
 def posterior(log_evidences: Mapping[str, float]) -> tuple[dict[str, float], float]:
-    """How probable each domain is after a view, by its evidence, and that it is none of them.
+    """The probability of each domain after a view, from its log evidence, and that of none of them.
 
-    What several processes have asked of domains of their own is put together by asking here once with all of it.
+    The evidence that several processes gathered from domains of their own is put together here, in one call.
     """
     n = len(log_evidences)
     prior = np.log([(1 - LOST_AT_START) / max(n, 1)] * n + [LOST_AT_START])
     logs = np.array([*log_evidences.values(), 0.0]) + prior
     weights = np.exp(logs - logs.max())
-    *of_domains, elsewhere = (weights / weights.sum()).tolist()
-    return dict(zip(log_evidences, of_domains, strict=True)), elsewhere
+    *p_domains, p_elsewhere = (weights / weights.sum()).tolist()
+    return dict(zip(log_evidences, p_domains, strict=True)), p_elsewhere
 
 
 class Atlas:
-    """Composed maps that are asked for one encoding together: the same as `log_evidence` of each, but for rounding.
+    """Composed maps whose `log_evidence` of an encoding is computed together, the same but for rounding.
 
-    Maps whose encodings are made unit vectors alike and compared with the same landmarks share that work.
+    Maps that make the same unit vectors of encodings and compare them with the same landmarks share that work.
 
     Args:
         maps: All `composed`, of encodings of one length d.
@@ -87,75 +87,78 @@ class Atlas:
         spaces: dict[int, list[tuple[int, tuple[NDArray[Any], ...]]]] = {}
         self._space_of = np.empty(len(maps), np.int64)
         distinct: list[tuple[NDArray[Any], ...]] = []
-        for at, map_ in enumerate(maps):
+        for index, map_ in enumerate(maps):
             space = _space(map_)
-            alike = spaces.setdefault(hash(space[3].tobytes()), [])
-            number = next((n for n, other in alike if all(map(np.array_equal, space, other))), None)
+            candidates = spaces.setdefault(hash(space[3].tobytes()), [])
+            number = next((n for n, other in candidates if all(map(np.array_equal, space, other))), None)
             if number is None:
                 number = len(distinct)
-                alike.append((number, space))
+                candidates.append((number, space))
                 distinct.append(space)
-            self._space_of[at] = number
+            self._space_of[index] = number
         self._spaces = tuple(_shelf(column) for column in zip(*distinct, strict=True))
         self._lists, self._lengths = _shelf([map_.lists for map_ in maps]), _shelf([map_.lengths for map_ in maps])
         self._n_landmarks = max(len(space[3]) for space in distinct)
         self._n_spaces = len(distinct)
 
     def log_evidences(self, encoding: NDArray[np.float32]) -> NDArray[np.float64]:
-        """[m] of one encoding [d]."""
+        """[m] log evidence of every map for one encoding [d]."""
         n = len(self.maps)
         products = np.empty((self._n_spaces, self._n_landmarks), np.float32)
-        strange, greatest = np.empty(self._n_spaces), np.empty(n)
+        far_shares, best_relevances = np.empty(self._n_spaces), np.empty(n)
         deviations = np.empty((self._n_spaces, encoding.size), np.float32)
         encoding = np.ascontiguousarray(encoding, np.float32)
-        _in_blocks(
-            self._n_spaces, lambda at, to: _compare(encoding, self._spaces, at, to, deviations, products, strange)
-        )
         weights = list_weights(max(map_.list_length for map_ in self.maps))
-        _in_blocks(
-            n, lambda at, to: _find(self._lists, self._lengths, weights, self._space_of, products, at, to, greatest)
-        )
-        return _weighed(greatest, self._scales, strange[self._space_of], np.full(n, encoding.size))
+
+        def compare(start: int, stop: int) -> None:
+            _compare(encoding, self._spaces, start, stop, deviations, products, far_shares)
+
+        def find(start: int, stop: int) -> None:
+            _find(self._lists, self._lengths, weights, self._space_of, products, start, stop, best_relevances)
+
+        _in_blocks(self._n_spaces, compare)
+        _in_blocks(n, find)
+        return _weighed(best_relevances, self._scales, far_shares[self._space_of], np.full(n, encoding.size))
 
 
 def _weighed(
-    greatest: NDArray[np.float64],
+    best_relevances: NDArray[np.float64],
     scales: NDArray[np.float64],
-    strange: NDArray[np.float64] | None,
+    far_shares: NDArray[np.float64] | None,
     n_numbers: NDArray[np.integer[Any]],
 ) -> NDArray[np.float64]:
-    """[m] the formula above."""
-    logs = RELEVANCE_WEIGHT * scales * (greatest - USUAL_RELEVANCE)
-    if strange is None:
+    """[m] log evidence by the formula of this module; without strangenesses by relevance alone."""
+    logs = RELEVANCE_WEIGHT * scales * (best_relevances - USUAL_RELEVANCE)
+    if far_shares is None:
         return logs
-    sure = np.minimum(1.0, np.sqrt(n_numbers / _SURE_NUMBERS))
-    return np.asarray(logs - STRANGENESS_WEIGHT * sure * (strange - USUAL_STRANGENESS))
+    certainty = np.minimum(1.0, np.sqrt(n_numbers / _SURE_NUMBERS))
+    return np.asarray(logs - STRANGENESS_WEIGHT * certainty * (far_shares - USUAL_STRANGENESS))
 
 
 def _space(map_: Map) -> tuple[NDArray[Any], ...]:
-    """What an encoding meets before it meets lists: mean and std [d], projection [d, k] or [0, 0], landmarks [r, k]."""
-    usual = map_.live_statistics
-    if usual is None or usual.encodings is None:
+    """How a map compares an encoding: mean and std [d], projection [d, k] or [0, 0], landmarks [r, k]."""
+    statistics = map_.live_statistics
+    if statistics is None or statistics.encodings is None:
         raise InvalidMapConfigError("the map does not know what is usual for encodings")
     model = map_.landmark_model
     projection = model.get("projection", np.empty((0, 0), np.float32))
     prototypes = np.asarray(model["prototypes"], np.float32)
-    return usual.encodings.mean, usual.encodings.std, np.asarray(projection, np.float32), prototypes
+    return statistics.encodings.mean, statistics.encodings.std, np.asarray(projection, np.float32), prototypes
 
 
 def _shelf(arrays: Sequence[NDArray[Any]]) -> Any:
-    """Arrays of one type, as compiled code takes any number of them."""
+    """Arrays of one type as a list for compiled code."""
     shelf = typed.List()
     for array in arrays:
-        same = np.ascontiguousarray(array).view()
-        same.setflags(write=False)
-        shelf.append(same)
+        view = np.ascontiguousarray(array).view()
+        view.setflags(write=False)
+        shelf.append(view)
     return shelf
 
 
 def _in_blocks(n: int, run: Any) -> None:
-    """Run over 0..n in blocks, in as many threads as there are cores."""
-    blocks = [(at, min(at + _AT_ONCE, n)) for at in range(0, n, _AT_ONCE)]
+    """Call `run(start, stop)` for blocks of 0..n, in as many threads as there are cores."""
+    blocks = [(start, min(start + _AT_ONCE, n)) for start in range(0, n, _AT_ONCE)]
     if len(blocks) == 1:
         run(0, n)
     else:
@@ -169,17 +172,17 @@ def _threads() -> ThreadPoolExecutor:
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _compare(encoding, spaces, first, stop, deviations, products, strange):  # type: ignore[no-untyped-def]
-    """Products [g, r] of an encoding's unit vectors with landmarks, and its strangeness [g], of spaces first..stop."""
+def _compare(encoding, spaces, first, stop, deviations, products, far_shares):  # type: ignore[no-untyped-def]
+    """Write an encoding's products [g, r] with landmarks and its strangeness [g], in spaces first..stop."""
     means, stds, projections, prototypes = spaces
     for g in range(first, stop):
         mean, std, projection, landmarks, z = means[g], stds[g], projections[g], prototypes[g], deviations[g]
         n_far = 0
         for i in range(encoding.size):
-            away = encoding[i] - mean[i]
-            n_far += abs(away) > FAR_STD * std[i]
-            z[i] = away / std[i]
-        strange[g] = n_far / encoding.size
+            difference = encoding[i] - mean[i]
+            n_far += abs(difference) > FAR_STD * std[i]
+            z[i] = difference / std[i]
+        far_shares[g] = n_far / encoding.size
         for i in range(encoding.size):
             if np.isnan(encoding[i]):
                 z[i] = 0.0
@@ -196,7 +199,7 @@ def _compare(encoding, spaces, first, stop, deviations, products, strange):  # t
             square += u[j] * u[j]
         length = max(np.sqrt(square), np.float32(1e-12))
         last = len(landmarks) - 1
-        for r in range(0, last + 1, 4):  # four at once, of which the last may be one and the same
+        for r in range(0, last + 1, 4):  # four at a time; beyond the end the last one again
             at_b, at_c, at_d = min(r + 1, last), min(r + 2, last), min(r + 3, last)
             a, b, c, d = landmarks[r], landmarks[at_b], landmarks[at_c], landmarks[at_d]
             of_a = of_b = of_c = of_d = np.float32(0)
@@ -210,27 +213,27 @@ def _compare(encoding, spaces, first, stop, deviations, products, strange):  # t
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS | {"nnan", "nsz"})
-def _find(all_lists, all_lengths, weights, space_of, products, first, stop, greatest):  # type: ignore[no-untyped-def]
-    """The greatest relevance [m] in maps first..stop; four places of the lists at once, the last four with the rest."""
+def _find(all_lists, all_lengths, weights, space_of, products, first, stop, best_relevances):  # type: ignore[no-untyped-def]
+    """Write the greatest relevance [m] of maps first..stop, four list positions at a time, the last with the rest."""
     n_places = -(-weights.size // 4) * 4
     tables = np.empty((n_places, products.shape[1]), np.float32)
-    before = np.zeros(_BLOCK, np.float32)
-    for at in range(first, stop):
-        lists, lengths, product = all_lists[at], all_lengths[at], products[space_of[at]]
+    buffer = np.zeros(_BLOCK, np.float32)
+    for number in range(first, stop):
+        lists, lengths, product = all_lists[number], all_lengths[number], products[space_of[number]]
         h, n = lists.shape
         for j in range(h):
             for r in range(product.size):
                 tables[j, r] = weights[j] * product[r]
-        tables[h:] = 0  # places that this map's lists have not weigh nothing
+        tables[h:] = 0  # positions beyond this map's lists weigh nothing
         best = np.float32(-np.inf)
         for start in range(0, n, _BLOCK):
-            here = slice(start, min(start + _BLOCK, n))
-            length, sums = lengths[here], before[: here.stop - start]
+            block = slice(start, min(start + _BLOCK, n))
+            length, sums = lengths[block], buffer[: block.stop - start]
             sums[:] = 0
             for j in range(0, n_places, 4):
                 a, b, c, d = tables[j], tables[j + 1], tables[j + 2], tables[j + 3]
-                u, v = lists[min(j, h - 1), here], lists[min(j + 1, h - 1), here]
-                x, y = lists[min(j + 2, h - 1), here], lists[min(j + 3, h - 1), here]
+                u, v = lists[min(j, h - 1), block], lists[min(j + 1, h - 1), block]
+                x, y = lists[min(j + 2, h - 1), block], lists[min(j + 3, h - 1), block]
                 if j + 4 < n_places:
                     for m in range(sums.size):
                         sums[m] += a[u[m]] + b[v[m]] + c[x[m]] + d[y[m]]
@@ -238,4 +241,4 @@ def _find(all_lists, all_lengths, weights, space_of, products, first, stop, grea
                     for m in range(sums.size):
                         relevance = (sums[m] + a[u[m]] + b[v[m]] + c[x[m]] + d[y[m]]) / length[m]
                         best = relevance if relevance > best else best
-        greatest[at] = best
+        best_relevances[number] = best

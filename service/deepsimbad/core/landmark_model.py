@@ -1,7 +1,7 @@
-"""Landmarks: the choice of candidates that are least like any other (II-B), and their model as it travels to robots.
+"""Landmarks: the choice of candidates that are least like any other (II-B), and their model as bytes for robots.
 
-A robot that ranks landmarks itself gets named arrays, and a digest that names them: of what ranks follow from, so two
-maps with the same landmarks have the same one whatever else differs.
+A robot that ranks landmarks itself gets named arrays, and a digest of those that decide ranks: two maps with the same
+landmarks have the same digest whatever else differs.
 """
 
 import hashlib
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from deepsimbad.errors import InvalidArchiveError, InvalidEncodingError, InvalidMapConfigError, TooFewCandidatesError
 
 _BLOCK = 1536  # candidates a side of one block of products: 9 MB, and large enough for the full speed of BLAS
-_ABOUT = ("evaluator", "map_version", "n_landmarks", "weights_sha256")
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # a zip's earliest time: the same model is the same bytes whenever it is written
+_METADATA = ("evaluator", "map_version", "n_landmarks", "weights_sha256")
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # a zip's earliest time, so that a model is the same bytes whenever it is written
 
 
 def select_landmarks(
     candidates: NDArray[np.float32], n_landmarks: int, on_progress: Callable[[float], None] | None = None
 ) -> NDArray[np.int64]:
-    """[r] the candidates [n, d] farthest from their nearest other candidate, best first, ties by index.
+    """[r] int64, those of candidates [n, d] that are farthest from their nearest other, best first, ties by index.
 
     Every pair is compared once, block by block, so memory holds no n x n matrix. Nearest neighbours are found in
     float32; their distances, which decide the order, are then computed again in float64.
@@ -49,7 +49,7 @@ def select_landmarks(
 
 
 def farthest_first(u: NDArray[np.float32], n_landmarks: int) -> NDArray[np.int64]:
-    """[r] rows of unit vectors [n, k], each least like the nearest of those before it; the first least like the mean.
+    """[r] int64, rows of unit vectors [n, k], each farthest from all before it, the first from the mean.
 
     Raises:
         TooFewCandidatesError: n < r.
@@ -59,23 +59,23 @@ def farthest_first(u: NDArray[np.float32], n_landmarks: int) -> NDArray[np.int64
     ids[0] = np.argmin(u @ u.mean(axis=0))
     nearest = u @ u[ids[0]]
     nearest[ids[0]] = np.inf
-    for place in range(1, n_landmarks):
-        ids[place] = np.argmin(nearest)
-        np.maximum(nearest, u @ u[ids[place]], out=nearest)
-        nearest[ids[place]] = np.inf
+    for rank in range(1, n_landmarks):
+        ids[rank] = np.argmin(nearest)
+        np.maximum(nearest, u @ u[ids[rank]], out=nearest)
+        nearest[ids[rank]] = np.inf
     return ids
 
 
-def fitting_number(asked: int | None, n_candidates: int, usual: int) -> int:
-    """r: what is asked for, else what is usual or, of fewer candidates, all of them.
+def fitting_number(n_landmarks: int | None, n_candidates: int, default: int) -> int:
+    """r: `n_landmarks` where it is given, else the default or, of fewer candidates, all of them.
 
     Raises:
-        TooFewCandidatesError: More are asked for than there are candidates.
+        TooFewCandidatesError: It is more than there are candidates.
     """
-    if asked is None:
-        return min(usual, n_candidates)
-    _check_number(n_candidates, asked)
-    return asked
+    if n_landmarks is None:
+        return min(default, n_candidates)
+    _check_number(n_candidates, n_landmarks)
+    return n_landmarks
 
 
 def _check_number(n_candidates: int, n_landmarks: int) -> None:
@@ -93,16 +93,16 @@ def _check_number(n_candidates: int, n_landmarks: int) -> None:
 def _nearest_neighbours(
     candidates: NDArray[np.float32], half_squares: NDArray[np.float32], on_progress: Callable[[float], None]
 ) -> NDArray[np.int64]:
-    """[n] index of each candidate's nearest other one. Half squared distance = |a|^2/2 + |b|^2/2 - a.b."""
+    """[n] index of each candidate's nearest other one; half a squared distance is |a|^2/2 + |b|^2/2 - a.b."""
     n_candidates = candidates.shape[0]
     nearest = np.zeros(n_candidates, np.int64)
-    least = np.full(n_candidates, np.inf, np.float32)
+    half_distances = np.full(n_candidates, np.inf, np.float32)
     starts = range(0, n_candidates, _BLOCK)
     n_blocks, n_done = len(starts) * (len(starts) + 1) // 2, 0
     for row in starts:
         for column in range(row, n_candidates, _BLOCK):
             rows, columns = candidates[row : row + _BLOCK], candidates[column : column + _BLOCK]
-            _keep_nearest(rows @ columns.T, half_squares, row, column, nearest, least)
+            _keep_nearest(rows @ columns.T, half_squares, row, column, nearest, half_distances)
             n_done += 1
             on_progress(n_done / n_blocks)
     return nearest
@@ -115,13 +115,13 @@ def _keep_nearest(
     row: int,
     column: int,
     nearest: NDArray[np.int64],
-    least: NDArray[np.float32],
+    half_distances: NDArray[np.float32],
 ) -> None:
-    """Take the block's distances into account for its rows and its columns alike."""
+    """Update the nearest candidates and their half squared distances [n], of a block's rows and columns."""
     n_rows, n_columns = products.shape
     for i in range(n_rows):
         a = row + i
-        best, best_b = least[a], nearest[a]
+        best, best_b = half_distances[a], nearest[a]
         for j in range(n_columns):
             b = column + j
             if a == b:
@@ -129,32 +129,32 @@ def _keep_nearest(
             half_distance = half_squares[a] + half_squares[b] - products[i, j]
             if half_distance < best:
                 best, best_b = half_distance, b
-            if half_distance < least[b]:
-                least[b] = half_distance
+            if half_distance < half_distances[b]:
+                half_distances[b] = half_distance
                 nearest[b] = a
-        if best < least[a]:
-            least[a], nearest[a] = best, best_b
+        if best < half_distances[a]:
+            half_distances[a], nearest[a] = best, best_b
 
 
-def _squared_distances(candidates: NDArray[np.float32], others: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[n] float64 squared distance of each candidate to the one named, a block at a time."""
+def _squared_distances(candidates: NDArray[np.float32], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[n] float64, squared distance of each candidate to its neighbour [n], a block at a time."""
     distances = np.empty(candidates.shape[0])
     for start in range(0, candidates.shape[0], _BLOCK):
         block = slice(start, start + _BLOCK)
-        difference = candidates[block].astype(np.float64) - candidates[others[block]]
+        difference = candidates[block].astype(np.float64) - candidates[neighbours[block]]
         distances[block] = np.einsum("nd,nd->n", difference, difference)
     return distances
 
 
 @dataclass(frozen=True)
 class PortableLandmarks:
-    """A map's landmark model and what a robot must know to rank by it."""
+    """A map's landmark model, and what a robot must know to rank by it."""
 
     model: Mapping[str, NDArray[np.generic]]  # the evaluator's named arrays
     n_landmarks: int
-    map_version: int  # of the map they come from
+    map_version: int  # of the map whose landmarks they are
     evaluator: Mapping[str, Any]  # the evaluator's configuration
-    # Of the weights that the map's images were encoded by; "" where nobody knows or there are none
+    # Of the network's weights that the map's images were encoded by; "" where there are none, or unknown
     weights_sha256: str = ""
 
 
@@ -169,16 +169,16 @@ def landmark_model_digest(model: Mapping[str, NDArray[np.generic]]) -> str:
 
 
 def pack_landmarks(portable: PortableLandmarks) -> bytes:
-    """A numpy npz of the model's arrays by name, and all else that is known as 0-d arrays, `evaluator` as JSON.
+    """A numpy npz of the model's arrays by name, and of the other fields as 0-d arrays, `evaluator` as JSON.
 
-    No pickles; the same bytes every time.
+    It holds no pickles, and is the same bytes every time.
 
     Raises:
-        InvalidArchiveError: An array of the model bears the name of one of those.
+        InvalidArchiveError: An array of the model has the name of such a field.
     """
-    if taken := set(_ABOUT) & portable.model.keys():
-        raise InvalidArchiveError(f"a landmark model has arrays of reserved names: {', '.join(sorted(taken))}")
-    about = {
+    if clashes := set(_METADATA) & portable.model.keys():
+        raise InvalidArchiveError(f"a landmark model has arrays of reserved names: {', '.join(sorted(clashes))}")
+    metadata = {
         "evaluator": np.array(json.dumps(dict(portable.evaluator), sort_keys=True)),
         "map_version": np.array(portable.map_version, np.int64),
         "n_landmarks": np.array(portable.n_landmarks, np.int64),
@@ -186,22 +186,22 @@ def pack_landmarks(portable: PortableLandmarks) -> bytes:
     }
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
-        for name, array in sorted({**portable.model, **about}.items()):
+        for name, array in sorted({**portable.model, **metadata}.items()):
             with archive.open(zipfile.ZipInfo(f"{name}.npy", _EPOCH), "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, _little_endian(np.asarray(array)), allow_pickle=False)
     return packed.getvalue()
 
 
 def unpack_landmarks(content: bytes) -> PortableLandmarks:
-    """Back from `pack_landmarks`; the arrays are frozen.
+    """The landmarks from the bytes of `pack_landmarks`; the arrays are frozen.
 
     Raises:
-        InvalidArchiveError: It is not what packing gives.
+        InvalidArchiveError: The bytes are none of that.
     """
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        evaluator, map_version, n_landmarks, weights_sha256 = (arrays.pop(name).item() for name in _ABOUT)
+        evaluator, map_version, n_landmarks, weights_sha256 = (arrays.pop(name).item() for name in _METADATA)
         configuration = dict(json.loads(evaluator))
     except (AttributeError, EOFError, KeyError, OSError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise InvalidArchiveError(f"not a landmark model: {error}") from error

@@ -1,7 +1,7 @@
-"""All that is known of a mapped route, as one frozen value: built, stored, served, checked and learnt from.
+"""A map: all that is known of a route, as one frozen value that is built, stored, served, checked and learnt from.
 
-Its arrays are named once, here, with their axes: what writes them, reads them, or takes some of the images need not
-know what they mean.
+Its arrays are named here alone, with their axes, so that code that writes, reads or selects them need not know what
+they mean.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -29,15 +29,15 @@ from deepsimbad.core.relevance import (
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError, LandmarkModelDiffersError
 
-UNKNOWN_FRAME = 0  # no digest was kept of what an image was made of
-_WORTH_STRANGE = 0.5  # what a view that shows nothing of the route counts for among what is usual
+UNKNOWN_FRAME = 0  # digest of a map image whose frame is unknown
+_WORTH_STRANGE = 0.5  # weight in a session's statistics of a view that shows nothing of the route
 DEFAULT_ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
 MOST_ACTION_M = 1000.0
-_USUAL_NOVELTY_M = 3.0  # over which views stop to err alike, where nobody measured it
-_SHARED = 0.5  # of the novelty curve, where nobody measured it
+_USUAL_NOVELTY_M = 3.0  # over which views cease to err alike, where it was not measured
+_SHARED = 0.5  # share of the novelty curve that repeats, where it was not measured
 _SAME_PLACE_M = 0.3
 
-# A relevance compares more than lists.
+# Arrays that relevances compare besides lists.
 _NEEDS: dict[str | None, tuple[str, ...]] = {
     Relevance.STANDARDISED: ("statistics",),
     Relevance.COMPOSED: ("statistics", "usual_encoding", "usual_product"),
@@ -50,9 +50,9 @@ def _row(dtype: type[np.generic], *axes: str | int, unknown: float | str | None 
     """One row of the table of named arrays.
 
     Args:
-        dtype: Of its numbers.
-        axes: n: map images in route order, h: places of a list, r: landmarks, a: actions, *: any length, or a number.
-        unknown: What an image holds of which this is not known; None: every image has it.
+        dtype: Of the array.
+        axes: n: map images in route order, h: list positions, r: landmarks, a: actions, *: any length; or a number.
+        unknown: Its value for an image of which it is unknown; None: every image has it.
     """
     return {"dtype": np.dtype(dtype), "axes": axes, "unknown": unknown}
 
@@ -62,8 +62,8 @@ class Map:
     """A mapped route; nothing in it changes, so any number of threads may read it.
 
     Attributes:
-        config: What it was built with; `relevance` and `n_landmarks` are in it.
-        domain, version, created_at: Which map; the time in ISO 8601, UTC.
+        config: What it was built with, `relevance` and `n_landmarks` among it.
+        domain, version, created_at: Which map it is; the time in ISO 8601, UTC.
         evaluator: The evaluator's configuration.
         closed: Whether the route is a loop.
         actions_m: [a] the moves of the domain in metres, ascending.
@@ -75,22 +75,22 @@ class Map:
         values: The listed dissimilarities (`simbad` alone).
         encodings: Of every map image (`brute_force` alone).
         statistics: Mean and std of every landmark's normal score over the map's drive. A live session starts from them.
-        loadings: On common factors, how landmarks go together, where the drive tells.
+        loadings: Of the landmarks on common factors, which give their correlations, where the drive tells.
         usual_encoding: Mean and std of every number of an encoding, over the seasons that the map knows (`composed`).
         usual_product: Mean and std of every landmark's product with the drive's unit encodings (`composed`).
-        likelihood_scale: What a relevance counts as a log-likelihood, where two seasons taught it.
+        likelihood_scale: The factor that makes a relevance a log-likelihood, where two seasons taught it.
         most_strange: How strange a view of a place may be (`relevance.strangeness`), where encodings are compared.
-        novelty: How much alike two views err that are 0, 1, 2.. m apart, 1 to 0.
-        repeated: How much of what a view says of wrong places the view 0, 1, 2.. m before has said too, 1 to 0.
-        view_bits: By how many bits a view from a place narrows the map down.
-        coverage: The chance that a single view from a place is placed rightly, NaN where unknown.
+        novelty: How alike two views err that are 0, 1, 2.. m apart, 1 to 0.
+        repeated: How much of what a view says of wrong places the view 0, 1, 2.. m before it said too, 1 to 0.
+        view_bits: Bits by which a view from a map image's place narrows the map down.
+        coverage: The chance that a single view from a map image's place is placed rightly, NaN where unknown.
         timestamp_us: Microseconds since 1970, -1 where unknown.
-        frame_digest: Which frame every image was made of (`Drive.digests`), 0 where nobody noted it.
+        frame_digest: Digest of the frame that every image was made of (`Drive.digests`), 0 where unknown.
         x_m, y_m: East and north, NaN where unknown.
-        frame_name: What the frame of every image is called in its recording, "" where unknown.
-        frame_drive: And the drive that it is of.
-        landmark_digest: Which frame every landmark began as, before sums of landmarks moved it, likewise.
-        landmark_frame, landmark_drive: What it is called, and the drive that it is of.
+        frame_name: Name of that frame in its recording, "" where unknown.
+        frame_drive: Name of the drive that the frame is of, "" where unknown.
+        landmark_digest: Digest of the frame that every landmark began as, before sums of landmarks moved it.
+        landmark_frame, landmark_drive: Names of that frame and of its drive.
         q_values: The experience database.
     """
 
@@ -155,11 +155,11 @@ class Map:
             row = ARRAYS[name]
             shape = tuple(lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in row.axes)
             fits = len(shape) == array.ndim and all(
-                want in {"*", length} for want, length in zip(shape, array.shape, strict=True)
+                wanted_length in {"*", length} for wanted_length, length in zip(shape, array.shape, strict=True)
             )
             if not fits or (array.dtype != row.dtype and not array.dtype.kind == row.dtype.kind == "U"):
                 raise InvalidMapConfigError(f"{name} is {array.dtype} {array.shape}, not {row.dtype} {list(shape)}")
-        if self.list_length > self.n_landmarks or self.lists.max() >= self.n_landmarks:  # scoring does not ask again
+        if self.list_length > self.n_landmarks or self.lists.max() >= self.n_landmarks:  # scoring does not check again
             raise InvalidMapConfigError(
                 f"lists of {self.list_length} name landmarks that are not among the {self.n_landmarks}"
             )
@@ -168,7 +168,8 @@ class Map:
         """Check that a map of whatever origin makes sense before it serves.
 
         Raises:
-            InvalidMapConfigError: What was learnt is NaN or infinite, nothing varies, or there is no way to move.
+            InvalidMapConfigError: An array holds NaN or infinity, a landmark or the route has no spread, or no robot
+                could move by its actions.
         """
         for name, array in self.arrays().items():
             if array.dtype.kind == "f" and ARRAYS[name].unknown is None and not np.isfinite(array).all():
@@ -180,12 +181,11 @@ class Map:
         check_actions(self.actions_m)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The named arrays that it has."""
-        named = {name: getattr(self, name) for name in ARRAYS}
-        return {name: array for name, array in named.items() if array is not None}
+        """Its named arrays, without those that it lacks."""
+        return {name: array for name in ARRAYS if (array := getattr(self, name)) is not None}
 
     def document(self) -> dict[str, Any]:
-        """All that is no array of its own, JSON-ready."""
+        """All of it but its arrays and landmark model, JSON-ready."""
         names = ("domain", "version", "created_at", "closed")
         return {
             **{name: getattr(self, name) for name in names},
@@ -204,46 +204,50 @@ class Map:
         arrays: Mapping[str, Any],
         index_bytes: int = 0,
     ) -> Self:
-        """Back from `document`, the landmark model and `arrays`.
+        """The map whose `document`, landmark model and `arrays` these are.
 
         Raises:
             InvalidMapConfigError, InvalidRouteError: They contradict each other.
-            KeyError, TypeError, ValueError: Or are not what a map gives.
+            KeyError, TypeError, ValueError: They are not those of a map.
         """
         parts = {name: document[name] for name in document.keys() - {"n_map_images", "n_landmarks", "list_length"}}
         parts["closed"] = bool(parts["closed"])
-        known = {name: array for name, array in arrays.items() if name in ARRAYS}  # earlier releases had others
-        return cls(**parts, landmark_model=landmark_model, index_bytes=index_bytes, **known)
+        map_arrays = {
+            name: array for name, array in arrays.items() if name in ARRAYS
+        }  # maps of earlier releases have others
+        return cls(**parts, landmark_model=landmark_model, index_bytes=index_bytes, **map_arrays)
 
     def at(self, images: NDArray[np.integer[Any]]) -> Self:
-        """The same map of some of its images alone, [m] in route order."""
-        some: dict[str, Any] = {
+        """The same map of the given images [m] alone, in route order."""
+        parts: dict[str, Any] = {
             name: np.ascontiguousarray(array.take(images, ARRAYS[name].axes.index("n")))
             for name, array in self.arrays().items()
             if "n" in ARRAYS[name].axes
         }
-        return replace(self, **some)
+        return replace(self, **parts)
 
     def with_images(self, new: Mapping[str, NDArray[Any] | None]) -> Self:
-        """With further images, merged by route position; of images at one position the old come first.
+        """The map with further images, merged by route position; of images at one position the old come first.
 
         Args:
-            new: Named arrays of the m new images. What only the old or only the new ones have is unknown of the others.
+            new: Named arrays of the m new images. An array that only the old or only the new images have is filled up
+                with its unknown value.
         """
-        both: dict[str, NDArray[Any]] = {}
+        arrays: dict[str, NDArray[Any]] = {}
         n_old, n_new = self.n_images, new["position_m"].size  # type: ignore[union-attr]
         for name, row in ARRAYS.items():
-            old, added = getattr(self, name), new.get(name)
-            if "n" not in row.axes or (old is None and added is None):
+            old_array, new_array = getattr(self, name), new.get(name)
+            if "n" not in row.axes or (old_array is None and new_array is None):
                 continue
-            if old is None:
-                old = np.full(n_old, row.unknown, row.dtype)
-            if added is None:
-                added = np.full(n_new, row.unknown, row.dtype)
-            both[name] = np.concatenate([old, added], axis=row.axes.index("n"))
-        order = np.argsort(both["position_m"], kind="stable")
+            if old_array is None:
+                old_array = np.full(n_old, row.unknown, row.dtype)
+            if new_array is None:
+                new_array = np.full(n_new, row.unknown, row.dtype)
+            arrays[name] = np.concatenate([old_array, new_array], axis=row.axes.index("n"))
+        order = np.argsort(arrays["position_m"], kind="stable")
         merged: dict[str, Any] = {
-            name: np.ascontiguousarray(array.take(order, ARRAYS[name].axes.index("n"))) for name, array in both.items()
+            name: np.ascontiguousarray(array.take(order, ARRAYS[name].axes.index("n")))
+            for name, array in arrays.items()
         }
         return replace(self, **merged)
 
@@ -264,66 +268,66 @@ class Map:
 
     @cached_property
     def n_bytes(self) -> int:
-        """What its arrays take in memory; what is worked out from them takes about as much as theirs of images."""
+        """Bytes of its arrays in memory; what is computed from them takes about as much as those of images."""
         return sum(array.nbytes for array in (*self.arrays().values(), *self.landmark_model.values()))
 
     @cached_property
     def relevance(self) -> Relevance:
-        """What it was built for; raises KeyError or ValueError where its configuration names none that exists."""
+        """The relevance it was built for; raises KeyError or ValueError where its configuration names none."""
         return Relevance(self.config["relevance"])
 
     @cached_property
     def goes_backward(self) -> bool:
-        """Whether a robot of the domain may be told to."""
+        """Whether some action of the domain is backward."""
         return bool(self.actions_m.min(initial=0.0) < 0)
 
     @cached_property
     def longest_action_m(self) -> float:
-        """Either way."""
+        """Length of the longest action, forward or backward."""
         return float(np.abs(self.actions_m).max(initial=0.0))
 
     @property
     def update_rule(self) -> UpdateRule:
-        """How a view changes the belief, where nobody chose."""
+        """How a view changes the belief by default."""
         return DEFAULT_UPDATE[self.relevance]
 
     @property
     def weights_sha256(self) -> str | None:
-        """Of the network that its images were encoded by; None where none did, or nobody knows."""
+        """SHA-256 of the network's weights that its images were encoded by; None where there are none, or unknown."""
         return weights_of(self.config)
 
     @property
     def index_bits_per_map_image(self) -> float:
-        """The paper's figure for the size of a map."""
+        """The paper's measure of a map's size."""
         return 8 * self.index_bytes / self.n_images
 
     @cached_property
     def route(self) -> Route:
-        """Where the map images are."""
+        """The route of the map images."""
         return Route(self.position_m, self.closed, self.x_m, self.y_m)
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
-        """Of the drives that it is made of, as far as they are known."""
+        """Cameras of the drives that it is made of, as far as they are known."""
         return tuple(Camera.from_dict(camera) for camera in self.config.get("cameras", ()))
 
     def landmark_origins(self) -> dict[str, Any]:
-        """The named arrays that tell which frames its landmarks began as; none where nobody noted it."""
-        named = {name: getattr(self, name) for name in ("landmark_digest", "landmark_frame", "landmark_drive")}
-        return {name: array for name, array in named.items() if array is not None}
+        """The named arrays of the frames that its landmarks began as; empty where unknown."""
+        origins = {name: getattr(self, name) for name in ("landmark_digest", "landmark_frame", "landmark_drive")}
+        return {name: array for name, array in origins.items() if array is not None}
 
     @cached_property
     def frames(self) -> NDArray[np.object_]:
-        """[n] what the frame of every image is called, None where unknown."""
-        named = np.full(self.n_images, None, object)
+        """[n] name of every image's frame, None where unknown."""
+        names = np.full(self.n_images, None, object)
         if self.frame_name is not None:
-            named[self.frame_name != ""] = self.frame_name[self.frame_name != ""]
-        named.setflags(write=False)
-        return named
+            names[self.frame_name != ""] = self.frame_name[self.frame_name != ""]
+        names.setflags(write=False)
+        return names
 
     @cached_property
     def live_statistics(self) -> LiveStatistics | None:
-        """What is usual at the start of a session; None where the relevance asks for none."""
+        """The statistics that a session starts from; None where the relevance needs none."""
         if self.statistics is None:
             return None
         encoding, product = (
@@ -334,24 +338,24 @@ class Map:
         return LiveStatistics(ranks, encoding, product)
 
     def is_strange(self, encoding: NDArray[np.float32], live: LiveStatistics | None = None) -> bool:
-        """Whether a view shows nothing of the route, by what is usual for encodings [d] there or in the session.
+        """Whether a view's encoding [d] shows nothing of the route, by the map's statistics or the session's.
 
-        Maps that were built before this was learnt take all views for views of places.
+        To maps without `most_strange`, of earlier releases, every view shows a place.
         """
-        usual = self.live_statistics
-        if self.most_strange is None or usual is None or usual.encodings is None:
+        statistics = self.live_statistics
+        if self.most_strange is None or statistics is None or statistics.encodings is None:
             return False
         live_encodings = None if live is None else live.encodings
-        return is_strange(encoding, usual.encodings, live_encodings, float(self.most_strange[0]))
+        return is_strange(encoding, statistics.encodings, live_encodings, float(self.most_strange[0]))
 
     def after_view(
         self, live: LiveStatistics | None, view: Query, moved_m: float | None
     ) -> tuple[LiveStatistics | None, bool]:
-        """A session's statistics with one view more, and whether that shows nothing of the route.
+        """A session's statistics with one view more, and whether the view shows nothing of the route.
 
         Args:
-            live: Before it; None where there are none.
-            moved_m: Metres since the view before; None: there was none.
+            live: The statistics before the view; None where the relevance needs none.
+            moved_m: Metres since the view before; None of a first view.
         """
         is_strange = view.encoding is not None and self.is_strange(view.encoding, live)
         if live is not None and view.is_informative:
@@ -361,43 +365,43 @@ class Map:
 
     @cached_property
     def lengths(self) -> NDArray[np.float32]:
-        """[n] length of the weighted sum of every image's landmarks (`composed`)."""
+        """[n] float32, length of the weighted sum of every image's landmarks (`composed`)."""
         return lengths_of_sums(self.lists, np.asarray(self.landmark_model["prototypes"], np.float32))
 
     @cached_property
     def information_tables(self) -> dict[float, NDArray[np.float32]]:
-        """What `planners.information_ahead` has worked out, by price."""
+        """The tables that `planners.information_ahead` has computed, by price in bits a metre."""
         return {}
 
     @cached_property
     def log_likelihood_scale(self) -> float:
-        """What a relevance, less its mean over the map, counts as a log-likelihood."""
+        """The factor that makes a relevance, less its mean over the map, a log-likelihood."""
         if self.likelihood_scale is not None:
             return float(self.likelihood_scale[0])
         return DEFAULT_LIKELIHOOD_SCALE.get(self.relevance, OTHER_LIKELIHOOD_SCALE)
 
     def alike_after(self, action_m: float) -> float:
-        """How much alike views err before and after a move, 1 to 0."""
+        """How alike views err before and after a move, 1 to 0."""
         if self.novelty is None:
             return float(np.exp(-abs(action_m) / _USUAL_NOVELTY_M))
         return float(np.interp(abs(action_m), np.arange(self.novelty.size), self.novelty))
 
     def shared_error_after(self, action_m: float) -> float:
-        """How much of a view's error is that of the view before: of one from the same place nearly all of it."""
-        shared = self.alike_after(action_m)
+        """Share of a view's error that is that of the view before a move; nearly all where both are of one place."""
+        share = self.alike_after(action_m)
         if self.repeated is None:
-            shared *= _SHARED
+            share *= _SHARED
         else:
-            shared *= float(np.interp(abs(action_m), np.arange(self.repeated.size), self.repeated))
-        return float(shared + (1 - shared) * np.exp(-abs(action_m) / _SAME_PLACE_M))
+            share *= float(np.interp(abs(action_m), np.arange(self.repeated.size), self.repeated))
+        return float(share + (1 - share) * np.exp(-abs(action_m) / _SAME_PLACE_M))
 
     @cached_property
     def landmark_model_digest(self) -> str:
-        """SHA-256 in hex of the landmark model; worked out at first need, in about a second a gigabyte."""
+        """SHA-256 in hex of the landmark model; computed at first need, in about a second a gigabyte."""
         return landmark_model_digest(self.landmark_model)
 
     def portable_landmarks(self) -> bytes:
-        """The landmark model as it travels to robots; not kept, for a map has megabytes of it already."""
+        """The landmark model as bytes for robots; packed at every call, since a map has megabytes of it already."""
         weights_sha256 = self.weights_sha256 or ""
         return pack_landmarks(
             PortableLandmarks(self.landmark_model, self.n_landmarks, self.version, self.evaluator, weights_sha256)
@@ -407,10 +411,10 @@ class Map:
         """Check that a view was ranked by this map's landmarks.
 
         Args:
-            digests: Of landmark models, one of which must be this map's; None: nobody parts by which.
+            digests: Of landmark models, one of which must be this map's; None: nothing is checked.
 
         Raises:
-            LandmarkModelDiffersError: None of them is.
+            LandmarkModelDiffersError: None of them is this map's.
         """
         if digests is None or self.landmark_model_digest in digests:
             return
@@ -425,7 +429,7 @@ class Map:
 
 @dataclass(frozen=True)
 class NamedArray:
-    """One row of the table of named arrays; see `_row`."""
+    """A named array's dtype, axes and unknown value; see `_row`."""
 
     dtype: np.dtype[Any]
     axes: tuple[str | int, ...]
@@ -437,7 +441,7 @@ ARRAYS = {row.name: NamedArray(**row.metadata) for row in fields(Map) if row.met
 
 
 def check_actions(actions_m: Sequence[float] | NDArray[np.float64]) -> None:
-    """Raise InvalidMapConfigError where no robot could move by them: metres, backward ones negative, ascending."""
+    """Raise InvalidMapConfigError where actions [a], in metres, are not ascending moves, or none goes anywhere."""
     moves_m = np.asarray(actions_m, np.float64)
     if not moves_m.size or not (np.abs(moves_m) <= MOST_ACTION_M).all() or not (np.diff(moves_m) > 0).all():
         raise InvalidMapConfigError(

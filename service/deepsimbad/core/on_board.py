@@ -1,7 +1,7 @@
-"""A view in the few bytes that a robot which encodes on board sends: its unit encoding, or its nearest landmarks.
+"""A view in few bytes, as a robot that encodes on board sends it: its unit encoding, or its nearest landmarks.
 
 On a `composed` map a unit encoding loses less in fewer bytes: a landmark's id tells which of r directions is near, a
-number of the encoding how far along one of its own (docs/results/onboard.md). Every other relevance compares ranks.
+number of the encoding how far it lies along one (docs/results/onboard.md). Every other relevance compares ranks.
 """
 
 from collections.abc import Sequence
@@ -14,20 +14,20 @@ from deepsimbad.core.descriptor import checked_ranking, wrong_number
 from deepsimbad.errors import InvalidEncodingError, InvalidInputError, InvalidRankedLandmarksError
 
 RANKS, UNIT_ENCODING = "application/vnd.deepsimbad.ranks", "application/vnd.deepsimbad.unit-encoding"
-"""Media types."""
+"""Media types of the two packed forms."""
 
-USUAL_BITS = 5  # a number: what more of them gain is lost among the seasons
+USUAL_BITS = 5  # a number; more bits gain less than seasons differ by
 _LEAST_BITS, _MOST_BITS = 2, 8
 
 
 def pack_unit_encoding(u: NDArray[np.floating], n_bits: int = USUAL_BITS) -> bytes:
     """A unit encoding [k] in one byte that says `n_bits`, 2..8, and k numbers of so many bits.
 
-    Numbers are even steps, as many below zero as above, of which the largest reaches the last: code c, from 0 to
-    2^bits - 2, stands for c - (2^(bits-1) - 1). Most significant bit first; zeros fill the last byte.
+    Numbers are rounded to even steps, as many below zero as above, of which the largest number reaches the last: code
+    c, from 0 to 2^bits - 2, stands for c - (2^(bits-1) - 1). Most significant bit first; zeros fill the last byte.
 
     Raises:
-        InvalidEncodingError: NaN or infinity, or another number of bits.
+        InvalidEncodingError: u holds NaN or infinity, or the bits are not within 2..8.
     """
     steps = _steps(n_bits)
     largest = float(np.abs(u).max())
@@ -38,7 +38,7 @@ def pack_unit_encoding(u: NDArray[np.floating], n_bits: int = USUAL_BITS) -> byt
 
 
 def unpack_unit_encoding(body: bytes, n_numbers: int) -> NDArray[np.float32]:
-    """[k] float32 of length 1 back from `pack_unit_encoding`; zeros where all were, of a view that shows nothing.
+    """[k] float32, the unit encoding from the bytes of `pack_unit_encoding`; zeros for a view that shows nothing.
 
     Raises:
         InvalidEncodingError: The body is not what packing k numbers gives.
@@ -54,7 +54,7 @@ def unpack_unit_encoding(body: bytes, n_numbers: int) -> NDArray[np.float32]:
 
 
 def _steps(n_bits: int) -> int:
-    """How many there are on either side of zero; raises InvalidEncodingError."""
+    """Number of steps on either side of zero; raises InvalidEncodingError where the bits are out of range."""
     if not _LEAST_BITS <= n_bits <= _MOST_BITS:
         raise InvalidEncodingError(
             f"a unit encoding has {_LEAST_BITS} to {_MOST_BITS} bits a number, not {n_bits}",
@@ -65,19 +65,19 @@ def _steps(n_bits: int) -> int:
 
 
 def pack_ranked_landmarks(landmark_ids: Sequence[int], n_landmarks: int) -> bytes:
-    """The nearest landmarks in the fewest bytes: m in two, big-endian, then m ids, nearest first.
+    """The nearest landmarks in few bytes: m in two, big-endian, then m ids, nearest first.
 
-    An id takes ceil(log2 r) bits, most significant first; the last byte is filled up with zeros.
+    An id takes ceil(log2 r) bits, most significant first; zeros fill the last byte.
 
     Raises:
-        InvalidRankedLandmarksError: None, too many, out of range or listed twice.
+        InvalidRankedLandmarksError: There are none or too many, or an id is out of range or listed twice.
     """
     ids = checked_ranking(landmark_ids, n_landmarks)
     return len(ids).to_bytes(2, "big") + _in_bits(ids, _bits_per_id(n_landmarks))
 
 
 def unpack_ranked_landmarks(body: bytes, n_landmarks: int) -> tuple[int, ...]:
-    """Back from `pack_ranked_landmarks`.
+    """The ids, nearest first, from the bytes of `pack_ranked_landmarks`.
 
     Raises:
         InvalidRankedLandmarksError: The body is not what packing 1..r distinct ids below r gives.
@@ -93,7 +93,7 @@ def unpack_ranked_landmarks(body: bytes, n_landmarks: int) -> tuple[int, ...]:
 
 
 def ranked_landmarks_within(n_bytes: int, n_landmarks: int) -> int:
-    """How many ranked landmarks, r at most, `pack_ranked_landmarks` brings into so many bytes."""
+    """How many ranked landmarks, at most r, `pack_ranked_landmarks` fits into `n_bytes`."""
     n_bits = _bits_per_id(n_landmarks)
     return n_landmarks if n_bits == 0 else min(n_landmarks, 8 * (n_bytes - 2) // n_bits)
 
@@ -103,7 +103,7 @@ def _bits_per_id(n_landmarks: int) -> int:
 
 
 def _in_bits(numbers: NDArray[np.int64], n_bits: int) -> bytes:
-    """Numbers [m] of so many bits each, most significant first; zeros fill the last byte."""
+    """Numbers [m] in `n_bits` each, most significant first; zeros fill the last byte."""
     bits = (numbers[:, np.newaxis] >> np.arange(n_bits - 1, -1, -1)) & 1
     return np.packbits(bits.astype(np.uint8).reshape(-1)).tobytes()
 
@@ -111,7 +111,7 @@ def _in_bits(numbers: NDArray[np.int64], n_bits: int) -> bytes:
 def _from_bits(
     packed: bytes, n_numbers: int, n_bits: int, error: type[InvalidInputError], **hints: int
 ) -> NDArray[np.int64]:
-    """[m] numbers back from `_in_bits`; raises `error` where that does not give these bytes."""
+    """[m] the numbers from the bytes of `_in_bits`; raises `error`, with `hints`, where they are none of that."""
     n_in_all = n_numbers * n_bits
     n_bytes = -(-n_in_all // 8)
     if len(packed) != n_bytes:

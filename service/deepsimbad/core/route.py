@@ -1,4 +1,4 @@
-"""The prelearned route: where along it, and on Earth, every map image was taken, and which show one place (II-C)."""
+"""The prelearned route: where along it, and on Earth, map images were taken, and which show the same place (II-C)."""
 
 import math
 from collections import defaultdict
@@ -15,8 +15,8 @@ from deepsimbad.errors import InvalidRouteError
 
 _NearPoint = Callable[[float, float], NDArray[np.intp]]
 _HISTOGRAM_BINS = 200
-_EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # of the Earth, by WGS 84
-_LEAST_LENGTH_M = 1e-9  # counted in steps that are far shorter, moves would overflow
+_EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # of the Earth's ellipsoid, WGS 84
+_LEAST_LENGTH_M = 1e-9  # on a shorter route moves counted in its steps would overflow
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Places:
     n_images: NDArray[np.intp]
 
     def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[n] values of images; those of one place have the mean of theirs."""
+        """[n] values of images, in which all images of a place have the mean of theirs."""
         if self.position_m.size == values.size:
             return values
         return np.asarray((np.bincount(self.of_image, values) / self.n_images)[self.of_image])
@@ -39,7 +39,7 @@ class Route:
     """Route positions of the map images, in route order."""
 
     position_m: NDArray[np.float64]  # [n] float64, non-decreasing, metres driven along the route
-    closed: bool = False  # the end joins the start
+    closed: bool = False  # whether the end joins the start
     # x_m, y_m: [n] float64 in the recording's plane, NaN where unknown; None where never known
     x_m: NDArray[np.float64] | None = None
     y_m: NDArray[np.float64] | None = None
@@ -78,13 +78,13 @@ class Route:
 
     @cached_property
     def length_m(self) -> float:
-        """Metres from the start to the end; of a closed route once around, back to the start."""
+        """Metres from the first map image to the last; of a closed route once around."""
         span = float(self.position_m[-1] - self.position_m[0])
         return span + self._closing_gap_m if self.closed else span
 
     @cached_property
     def _closing_gap_m(self) -> float:
-        """Metres from the last map image on to the first: in the plane where known, else a usual step."""
+        """Metres from the last map image on to the first, in the plane where known, else the median step."""
         if self.x_m is not None and self.y_m is not None:
             gap = float(np.hypot(self.x_m[0] - self.x_m[-1], self.y_m[0] - self.y_m[-1]))
             if np.isfinite(gap):
@@ -97,20 +97,20 @@ class Route:
     def cell_m(self) -> NDArray[np.float64]:
         """[n] metres of route that each map image stands for: half the way to either neighbour.
 
-        Images taken while standing still share one place's cell. A route of no length has equal cells.
+        Images taken while the robot stood share one place's cell. A route of no length has equal cells.
         """
         steps = np.diff(self.position_m)
         if self.length_m <= 0:
             return np.ones(self.n_images)
         if self.closed:
-            before, after = np.r_[self._closing_gap_m, steps], np.r_[steps, self._closing_gap_m]
+            gap_before_m, gap_after_m = np.r_[self._closing_gap_m, steps], np.r_[steps, self._closing_gap_m]
         else:
-            before, after = np.r_[steps[:1], steps], np.r_[steps, steps[-1:]]
-        cells = (before + after) / 2
+            gap_before_m, gap_after_m = np.r_[steps[:1], steps], np.r_[steps, steps[-1:]]
+        cells = (gap_before_m + gap_after_m) / 2
         return cells if cells.sum() > 0 else np.ones(self.n_images)
 
     def offset_m(self, position_m: NDArray[np.float64], from_m: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed metres along the route to positions, from one or each from its own; the short way on a closed one."""
+        """Signed metres along the route from `from_m` to positions, broadcast; on a closed route the short way."""
         offset = np.asarray(position_m, np.float64) - from_m
         if not self.closed or self.length_m <= 0:
             return offset
@@ -120,21 +120,21 @@ class Route:
     def apart_m(
         self, images: NDArray[np.int64], position_m: float, x_m: float | None, y_m: float | None
     ) -> NDArray[np.float64]:
-        """[k] distance of images from a place, in the plane where both are known there, else along the route."""
-        along = np.abs(self.offset_m(self.position_m[images], position_m))
+        """[k] metres of images [k] from a place, in the plane where both are known there, else along the route."""
+        along_m = np.abs(self.offset_m(self.position_m[images], position_m))
         if x_m is None or y_m is None or self.x_m is None or self.y_m is None:
-            return along
-        plane = np.hypot(self.x_m[images] - x_m, self.y_m[images] - y_m)
-        return np.where(np.isfinite(plane), plane, along)
+            return along_m
+        plane_m = np.hypot(self.x_m[images] - x_m, self.y_m[images] - y_m)
+        return np.where(np.isfinite(plane_m), plane_m, along_m)
 
     def wrapped(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Positions within the first turn of a closed route; of an open one as they are."""
+        """Positions brought into the first turn of a closed route; those of an open one unchanged."""
         if not self.closed or self.length_m <= 0:
             return position_m
         return np.asarray(self.start_m + (position_m - self.start_m) % self.length_m)
 
     def reaches(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether positions are on the route: of an open one not past its ends, but for rounding."""
+        """Whether positions are on the route; those past the ends of an open one are not, but for rounding."""
         inside = (position_m >= self.start_m - 1e-9) & (position_m <= self.position_m[-1] + 1e-9)
         return np.asarray(inside | self.closed)
 
@@ -146,7 +146,7 @@ class Route:
 
     @cached_property
     def cells(self) -> Cells:
-        """Of equal length, for a grid belief."""
+        """Cells of equal length, for a grid belief."""
         return Cells.for_places(self.places.position_m, self.length_m, self.closed)
 
     @cached_property
@@ -156,7 +156,7 @@ class Route:
 
     @cached_property
     def turn(self) -> NDArray[np.float64]:
-        """[2, n] cosine and sine of how far round a closed route every map image is; [2, 0] of an open one."""
+        """[2, n] cosine and sine of every map image's angle around a closed route; [2, 0] of an open one."""
         if not self.closed or self.length_m <= 0:
             return np.empty((2, 0))
         angle = 2 * np.pi / self.length_m * (self.position_m - self.start_m)
@@ -165,11 +165,11 @@ class Route:
     def nearest_image(self, position_m: NDArray[np.float64]) -> NDArray[np.intp]:
         """The map image nearest to each position along the route; of two equally near the earlier."""
         images_m = self.position_m
-        after = np.clip(np.searchsorted(images_m, position_m), 1, max(self.n_images - 1, 1))
+        upper = np.clip(np.searchsorted(images_m, position_m), 1, max(self.n_images - 1, 1))
         if self.n_images == 1:
             return np.zeros(np.shape(position_m), np.intp)
-        before = after - 1
-        nearest = np.where(position_m - images_m[before] <= images_m[after] - position_m, before, after)
+        lower = upper - 1
+        nearest = np.where(position_m - images_m[lower] <= images_m[upper] - position_m, lower, upper)
         if self.closed:  # behind the last image the first may be nearer
             behind = position_m - images_m[-1]
             nearest = np.where(behind > self._closing_gap_m - behind, 0, nearest)
@@ -177,38 +177,40 @@ class Route:
 
     @cached_property
     def histogram_edges_m(self) -> NDArray[np.float64]:
-        """[b + 1] of equal bins over the whole route, at most 200."""
+        """[b + 1] edges of at most 200 equal bins over the whole route."""
         n_bins = min(_HISTOGRAM_BINS, self.n_images) if self.length_m > 0 else 1
         return np.linspace(self.start_m, self.start_m + self.length_m, n_bins + 1)
 
     def histogram_of(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[b] what those bins hold of masses of map images [n]; each is spread over the stretch it stands for."""
-        whole, share = self._bin_ends
-        begun = share * mass[np.minimum(whole, self.n_images - 1)]
-        held = _sums_up_to(mass, whole) + begun
-        held[1:] -= begun[:-1]
-        return np.maximum(held, 0.0)  # but for rounding it is no less
+        """[b] masses of those bins, from masses of map images [n] that each spread over the stretch it stands for."""
+        n_whole, share = self._bin_ends
+        partial_mass = share * mass[np.minimum(n_whole, self.n_images - 1)]
+        bin_mass = _sums_up_to(mass, n_whole) + partial_mass
+        bin_mass[1:] -= partial_mass[:-1]
+        return np.maximum(bin_mass, 0.0)  # rounding may make it less
 
     @cached_property
     def _bin_ends(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """[b] how many images' stretches end before the end of every bin, and the share of the next that lies in it."""
+        """[b], [b] number of images whose stretches end before each bin's end, and the next one's share before it."""
         until_m = np.append((self.position_m[1:] + self.position_m[:-1]) / 2, self.histogram_edges_m[-1])
         from_m, end_m = np.append(self.start_m, until_m), self.histogram_edges_m[1:]
-        whole = np.searchsorted(until_m, end_m, side="right")
-        next_one = np.minimum(whole, self.n_images - 1)
-        length_m = until_m[next_one] - from_m[next_one]
-        share = np.where(whole < self.n_images, (end_m - from_m[next_one]) / np.maximum(length_m, _LEAST_LENGTH_M), 0.0)
-        return whole, share
+        n_whole = np.searchsorted(until_m, end_m, side="right")
+        next_image = np.minimum(n_whole, self.n_images - 1)
+        length_m = until_m[next_image] - from_m[next_image]
+        share = np.where(
+            n_whole < self.n_images, (end_m - from_m[next_image]) / np.maximum(length_m, _LEAST_LENGTH_M), 0.0
+        )
+        return n_whole, share
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _sums_up_to(values: NDArray[np.float64], ends: NDArray[np.intp]) -> NDArray[np.float64]:
-    """[b] sums of the values [n] before every end [b], from the one before it on."""
+    """[b] sums of the values [n] between every end [b] and the end before."""
     sums, begin = np.zeros(ends.size), 0
     for number in range(ends.size):
-        total, some = 0.0, values[begin : ends[number]]
-        for place in range(some.size):
-            total += some[place]
+        total, span = 0.0, values[begin : ends[number]]
+        for i in range(span.size):
+            total += span[i]
         sums[number], begin = total, ends[number]
     return sums
 
@@ -220,23 +222,23 @@ def true_images_of(
     max_heading_rad: float = np.pi / 2,
     frames: NDArray[np.int64] | None = None,
 ) -> list[NDArray[np.int64]]:
-    """For every query frame, or for some of them, the map images within the tolerance.
+    """The map images within the tolerance of every query frame, or of the given frames.
 
-    In the plane (x, y) where both routes know it; else along the route. A map image within the tolerance in the
-    plane but driven in another direction shows something else, so heading, taken from the paths themselves, must
-    agree within `max_heading_rad`.
+    Distance is in the plane (x, y) where both routes know it, else along the route. A map image near in the plane but
+    driven in another direction shows something else, so the headings of the two paths must agree within
+    `max_heading_rad`.
 
     Returns:
-        One ascending int64 array of map image ids a query frame; empty where there is none.
+        For each query frame an ascending int64 array of map image ids; empty where there is none.
     """
-    asked = np.arange(query.n_images) if frames is None else frames
+    query_frames = np.arange(query.n_images) if frames is None else frames
     if query.x_m is None or query.y_m is None or map_route.x_m is None or map_route.y_m is None:
-        return [_near_along(map_route, float(query.position_m[frame]), tolerance_m) for frame in asked]
+        return [_near_along(map_route, float(query.position_m[frame]), tolerance_m) for frame in query_frames]
     x_m, y_m, headings = query.x_m, query.y_m, query.heading_rad
     map_x_m, map_y_m, map_headings = map_route.x_m, map_route.y_m, map_route.heading_rad
     candidates = _near_in_plane(map_x_m, map_y_m, tolerance_m)
     near_frames = []
-    for frame in asked:
+    for frame in query_frames:
         ids = candidates(float(x_m[frame]), float(y_m[frame]))
         near = np.hypot(map_x_m[ids] - x_m[frame], map_y_m[ids] - y_m[frame]) <= tolerance_m
         turn = np.abs((map_headings[ids] - headings[frame] + np.pi) % (2 * np.pi) - np.pi)
@@ -245,25 +247,25 @@ def true_images_of(
 
 
 def same_places(frames: Route, map_route: Route, tolerance_m: float = 2.0) -> NDArray[np.int64]:
-    """Pairs (map image, frame) [k, 2] of the same place: for every frame the nearest of its true map images."""
+    """[k, 2] pairs (map image, frame) of the same place: every frame with the nearest of its true map images."""
     planes = (frames.x_m, frames.y_m, map_route.x_m, map_route.y_m)
     pairs = []
     for frame, near in enumerate(true_images_of(frames, map_route, tolerance_m)):
         if near.size == 0:
             continue
         if any(axis is None for axis in planes):
-            apart = np.abs(map_route.offset_m(map_route.position_m[near], float(frames.position_m[frame])))
+            distance_m = np.abs(map_route.offset_m(map_route.position_m[near], float(frames.position_m[frame])))
         else:
             x_m, y_m, map_x_m, map_y_m = (np.asarray(axis) for axis in planes)
-            apart = np.hypot(map_x_m[near] - x_m[frame], map_y_m[near] - y_m[frame])
-        pairs.append((int(near[np.argmin(apart)]), frame))
+            distance_m = np.hypot(map_x_m[near] - x_m[frame], map_y_m[near] - y_m[frame])
+        pairs.append((int(near[np.argmin(distance_m)]), frame))
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
 def _near_along(map_route: Route, at_m: float, tolerance_m: float) -> NDArray[np.int64]:
-    if map_route.closed:  # either end may be near
+    if map_route.closed:  # images at either end may be near
         return np.flatnonzero(np.abs(map_route.offset_m(map_route.position_m, at_m)) <= tolerance_m)
-    slack_m = 1e-9 * (abs(at_m) + 1.0)  # the window may round otherwise than the distance that decides
+    slack_m = 1e-9 * (abs(at_m) + 1.0)  # the window must not round to less than the distance below, which decides
     window_m = (at_m - tolerance_m - slack_m, at_m + tolerance_m + slack_m)
     first, last = np.searchsorted(map_route.position_m, window_m)
     near = np.abs(map_route.offset_m(map_route.position_m[first:last], at_m)) <= tolerance_m
@@ -271,19 +273,19 @@ def _near_along(map_route: Route, at_m: float, tolerance_m: float) -> NDArray[np
 
 
 def _near_in_plane(x_m: NDArray[np.float64], y_m: NDArray[np.float64], tolerance_m: float) -> _NearPoint:
-    """A function from a point to a few map images, all within the tolerance among them, in order.
+    """A function from a point to a few map images, in order, which include all within the tolerance.
 
-    The plane is cut into squares as wide as the tolerance, so that whatever is near lies in the point's square or in
-    one of the eight around it: a drive of 26,000 frames is matched in a second, not in half a minute.
+    The plane is cut into squares as wide as the tolerance, so that all near images are in the point's square or in one
+    of the eight around it: a drive of 26,000 frames is matched in a second, not in half a minute.
     """
-    every = np.arange(x_m.size)
-    placed = every[np.isfinite(x_m) & np.isfinite(y_m)]
+    all_images = np.arange(x_m.size)
+    located = all_images[np.isfinite(x_m) & np.isfinite(y_m)]
     if not np.isfinite(tolerance_m) or tolerance_m <= 0:
-        return lambda _x, _y: every
-    nowhere = every[:0]
+        return lambda _x, _y: all_images
+    nowhere = all_images[:0]
     squares: defaultdict[tuple[float, float], list[int]] = defaultdict(list)
-    columns, rows = np.floor(x_m[placed] / tolerance_m), np.floor(y_m[placed] / tolerance_m)
-    for image, column, row in zip(placed.tolist(), columns.tolist(), rows.tolist(), strict=True):
+    columns, rows = np.floor(x_m[located] / tolerance_m), np.floor(y_m[located] / tolerance_m)
+    for image, column, row in zip(located.tolist(), columns.tolist(), rows.tolist(), strict=True):
         squares[column, row].append(image)
     around = [(right, up) for right in (-1, 0, 1) for up in (-1, 0, 1)]
 
@@ -298,26 +300,26 @@ def _near_in_plane(x_m: NDArray[np.float64], y_m: NDArray[np.float64], tolerance
 
 
 def _headings(route: Route, over_m: float = 1.0) -> NDArray[np.float64]:
-    """[n] direction of travel in the plane, by the chord over a metre to either side or a neighbour; NaN if unknown."""
+    """[n] direction of travel in the plane, by the chord over `over_m`, or a neighbour, either way; NaN if unknown."""
     image, last = np.arange(route.n_images), route.n_images - 1
-    before = np.searchsorted(route.position_m, route.position_m - over_m, side="left")
-    after = np.searchsorted(route.position_m, route.position_m + over_m, side="right") - 1
-    before, after = np.minimum(before, np.maximum(image - 1, 0)), np.maximum(after, np.minimum(image + 1, last))
+    begin = np.searchsorted(route.position_m, route.position_m - over_m, side="left")
+    end = np.searchsorted(route.position_m, route.position_m + over_m, side="right") - 1
+    begin, end = np.minimum(begin, np.maximum(image - 1, 0)), np.maximum(end, np.minimum(image + 1, last))
     x, y = route.x_m, route.y_m
     if x is None or y is None:
         return np.full(route.n_images, np.nan)
-    dx, dy = x[after] - x[before], y[after] - y[before]
+    dx, dy = x[end] - x[begin], y[end] - y[begin]
     return np.where((dx == 0) & (dy == 0), np.nan, np.arctan2(dy, dx))
 
 
 def on_earth(
     x_m: float, y_m: float, lat_deg: float, lon_deg: float, bearing_deg: float, height_m: float
 ) -> tuple[float, float]:
-    """(latitude, longitude) in degrees, WGS 84, of a place, by the meridian and the parallel through an anchor.
+    """(latitude, longitude) in degrees, WGS 84, of a place, by the meridian and the parallel through the origin.
 
     Args:
-        lat_deg, lon_deg, height_m: Of the origin; metres above the ellipsoid.
-        bearing_deg: Of the axis y, clockwise from north.
+        lat_deg, lon_deg, height_m: Of the origin, the height above the ellipsoid.
+        bearing_deg: Of the y axis, clockwise from north.
     """
     turned = math.radians(bearing_deg)
     east_m = x_m * math.cos(turned) + y_m * math.sin(turned)

@@ -43,7 +43,7 @@ def slow_move(mass: np.ndarray, cells: float, std_cells: float, closed: bool) ->
 )
 def test_on_equal_steps_the_beliefs_are_those_of_plain_loops(closed, additive, spacing_m, actions_m):
     route = equal_route(120, spacing_m, closed)
-    lattice = Lattice.along(route, np.zeros(1))  # not cut to the moves: the cells are the images
+    lattice = Lattice.of_route(route, np.zeros(1))  # not cut to the moves: the cells are the images
     assert lattice.n_cells == 120
     stds_m = [0.72, 0.33]  # cut off between two images, so that rounding decides nothing
     moves = moves_along(lattice, actions_m, stds_m)
@@ -69,7 +69,7 @@ def test_on_equal_steps_the_beliefs_are_those_of_plain_loops(closed, additive, s
 
 def test_beliefs_do_not_touch_each_other_and_ranks_count_images():
     route = equal_route(50, 1.0, closed=False)
-    lattice = Lattice.along(route, np.array([1.0, 5.0]))
+    lattice = Lattice.of_route(route, np.array([1.0, 5.0]))
     moves = moves_along(lattice, (1.0, 5.0), (0.4, 0.9))
     rng = np.random.default_rng(0)
     seen = rng.random((3, 50), np.float32)
@@ -89,7 +89,7 @@ def test_beliefs_do_not_touch_each_other_and_ranks_count_images():
 
 def test_uneven_images_take_the_cell_nearest_to_them():
     position_m = np.array([0.0, 0.0, 0.0, 1.1, 1.9, 3.0, 3.0, 6.0])
-    lattice = Lattice.along(Route(position_m), np.array([-2.0, 0.0, 1.0]))
+    lattice = Lattice.of_route(Route(position_m), np.array([-2.0, 0.0, 1.0]))
     assert lattice.step_m == 1.0
     assert lattice.cell_of_image.tolist() == [0, 0, 0, 1, 2, 3, 3, 6]
     assert lattice.images_in_cell.tolist() == [3, 1, 1, 2, 0, 0, 1]
@@ -101,7 +101,7 @@ def test_uneven_images_take_the_cell_nearest_to_them():
 
 
 def test_a_belief_that_would_be_wholly_past_the_end_stays():
-    lattice = Lattice.along(equal_route(10, 1.0, closed=False), np.ones(1))
+    lattice = Lattice.of_route(equal_route(10, 1.0, closed=False), np.ones(1))
     beliefs = np.zeros((1, 10), np.float32)
     beliefs[0, 8] = 1
     moves = moves_along(lattice, (3.0,), (0.0,))
@@ -111,7 +111,7 @@ def test_a_belief_that_would_be_wholly_past_the_end_stays():
 
 
 def test_evidence_against_every_place_is_not_believed():
-    lattice = Lattice.along(equal_route(10, 1.0, closed=False), np.ones(1))
+    lattice = Lattice.of_route(equal_route(10, 1.0, closed=False), np.ones(1))
     beliefs = uniform_beliefs(lattice, 1)
     moves = moves_along(lattice, (1.0,), (0.0,))
     step_beliefs(lattice, beliefs, moves, np.zeros((1, 10), np.float32), np.array([8]), additive=False)
@@ -121,7 +121,7 @@ def test_evidence_against_every_place_is_not_believed():
 
 def test_one_place_and_one_image():
     for position_m in ([2.0], [2.0, 2.0, 2.0]):
-        lattice = Lattice.along(Route(np.array(position_m)), np.ones(1))
+        lattice = Lattice.of_route(Route(np.array(position_m)), np.ones(1))
         assert lattice.n_cells == len(position_m) or lattice.n_cells == 1
         beliefs = uniform_beliefs(lattice, 1)
         moves = moves_along(lattice, (1.0,), (0.5,))

@@ -1,8 +1,8 @@
-"""Many beliefs at once for training: the grid filter on cells of equal length, in a few passes (II-C, II-D).
+"""Many beliefs at once for training: the grid filter on cells of equal length (II-C, II-D).
 
-On equal cells a move is a shift and its error one short row of weights, the same everywhere. There are about as many
-cells as map images; where the images stand at equal distances the cells are the images, and the beliefs those of
-`GridFilter`. Else a cell takes the evidence of the image nearest to it, as the paper's particles do.
+On equal cells a move is a shift, and its error a short row of weights that is the same everywhere. There are about as
+many cells as map images; where the images stand at equal distances the cells are the images, and the beliefs those of
+`GridFilter`. Else a cell takes the evidence of its nearest image, as the paper's particles do.
 """
 
 from collections.abc import Sequence
@@ -17,35 +17,34 @@ from deepsimbad.core.belief.motion import move_error
 from deepsimbad.core.route import Route
 
 _TAPS_AT_ONCE = 4
-_WHOLE = 1e-4  # of a cell; a lesser part of one is a rounding of positions
+_WHOLE = 1e-4  # of a cell; a smaller fraction is taken for rounding of positions
 _BLOCK = 2048  # cells whose sums stay in the first-level cache
 
-
 NO_MOVE = np.iinfo(np.int64).min
-"""The shift of a first view."""
+"""The shift before a first view."""
 
 
 class Moves(NamedTuple):
     """One move of every belief, in cells."""
 
-    shift: NDArray[np.int64]  # [e] int64, whole cells, backward ones negative; NO_MOVE: this is a first view
-    fraction: NDArray[np.float32]  # [e] float32, the part of a cell moved besides, 0..1
+    shift: NDArray[np.int64]  # [e] int64, whole cells, negative backward; NO_MOVE before a first view
+    fraction: NDArray[np.float32]  # [e] float32, fraction of a cell moved besides, 0..1
     taps: NDArray[np.float32]  # [e, 2w + 1] float32, weights of the move's error
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cells along a route."""
+    """Cells of equal length along a route."""
 
-    step_m: float  # their length
-    closed: bool  # the last joins the first
+    step_m: float  # length of a cell
+    closed: bool  # whether the last cell joins the first
     image_of_cell: NDArray[np.int32]  # [c] int32, the map image nearest to every cell
-    cell_of_image: NDArray[np.int64]  # [n] int64
-    images_in_cell: NDArray[np.int32]  # [c] int32, how many map images have a cell as their nearest
+    cell_of_image: NDArray[np.int64]  # [n] int64, the cell nearest to every map image
+    images_in_cell: NDArray[np.int32]  # [c] int32, number of map images whose nearest cell it is
 
     @classmethod
-    def along(cls, route: Route, actions_m: NDArray[np.float64]) -> "Lattice":
-        """Cells as long as map images are apart on average, and a whole part of the shortest move if that is longer."""
+    def of_route(cls, route: Route, actions_m: NDArray[np.float64]) -> "Lattice":
+        """Cells as long as the mean step between map images; on an open route a longer shortest move is whole cells."""
         shortest_action_m = float(np.abs(actions_m[actions_m != 0]).min(initial=np.inf))
         n = route.n_images
         n_steps = n if route.closed else n - 1
@@ -75,7 +74,7 @@ class Lattice:
 
 
 def moves_along(lattice: Lattice, actions_m: Sequence[float], stds_m: Sequence[float]) -> Moves:
-    """The moves of a domain, [a], each with its deviation."""
+    """The actions [a] of a domain as moves on the lattice, each with its standard deviation."""
     cells = np.array(actions_m, np.float64) / lattice.step_m
     shift = np.floor(cells + _WHOLE).astype(np.int64)
     fraction = cells - shift
@@ -89,7 +88,7 @@ def moves_along(lattice: Lattice, actions_m: Sequence[float], stds_m: Sequence[f
 
 
 def uniform_beliefs(lattice: Lattice, n_beliefs: int) -> NDArray[np.float32]:
-    """[e, c] beliefs that know nothing; a weight's mean is 1."""
+    """[e, c] float32, beliefs that know nothing; the mean weight is 1."""
     return np.ones((n_beliefs, lattice.n_cells), np.float32)
 
 
@@ -101,16 +100,16 @@ def step_beliefs(
     true_image: NDArray[np.int64],
     additive: bool,
 ) -> NDArray[np.float64]:
-    """Move, blur and update beliefs in place, and rank the truth's.
+    """Move, blur and update beliefs in place, and rank the belief at the truth.
 
     Args:
-        beliefs: [e, c] weights; come back with any total, which the next step takes into account.
+        beliefs: [e, c] weights, of any total before and after.
         evidence: [e, n] of every map image.
         true_image: [e] map image nearest to the robot; below 0: unknown.
-        additive: Evidence is added to weights of mean 1; else it multiplies them.
+        additive: Whether evidence is added to weights of mean 1, or multiplies them.
 
     Returns:
-        [e] the truth's rank from 0: map images with a strictly greater belief, and half the others tied; -1 unknown.
+        [e] rank of the truth from 0: map images with a strictly greater belief, and half the others tied; -1 unknown.
     """
     ranks = np.empty(len(beliefs))
     true_cell = np.where(true_image >= 0, lattice.cell_of_image[true_image], -1)
@@ -135,73 +134,75 @@ def _step(
 ) -> None:
     n_beliefs, n_cells = beliefs.shape
     reach = taps.shape[1] // 2
-    # moved[reach + c] is cell c; beyond the ends zeros, or the other end of a closed route
-    moved = np.zeros(n_cells + 2 * reach + 2 * _TAPS_AT_ONCE, np.float32)
+    # buffer[reach + c] is cell c after the shift; beyond the ends are zeros, or the other end of a closed route
+    buffer = np.zeros(n_cells + 2 * reach + 2 * _TAPS_AT_ONCE, np.float32)
     for e in range(n_beliefs):
-        belief, at_cells = beliefs[e], moved[reach : reach + n_cells]
+        belief, at_cells = beliefs[e], buffer[reach : reach + n_cells]
         total = np.float32(0.0)
         if shift[e] != NO_MOVE:
             total = _shift(belief, shift[e], fraction[e], closed, at_cells)
-        if total > 0:  # else a first view; or no place has that much route ahead, and the belief stays
-            _pad(moved, reach, n_cells, taps[e], closed)
-            _blur(moved, taps[e], np.float32(n_cells) / total, belief)
+        if total > 0:  # else it is a first view, or no place has that much route ahead and the belief stays
+            _pad(buffer, reach, n_cells, taps[e], closed)
+            _blur(buffer, taps[e], np.float32(n_cells) / total, belief)
         else:
             belief *= np.float32(n_cells) / belief.sum()
         at_cells[:] = belief
-        if _see(belief, evidence[e], image_of_cell, additive) <= 0:  # what this view allows was already excluded
+        if (
+            _see(belief, evidence[e], image_of_cell, additive) <= 0
+        ):  # the belief had excluded all that the view allows, and stays
             belief[:] = at_cells
         ranks[e] = _rank(belief, images_in_cell, true_cell[e])
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _shift(
-    belief: NDArray[np.float32], shift: int, fraction: np.float32, closed: bool, moved: NDArray[np.float32]
+    belief: NDArray[np.float32], shift: int, fraction: np.float32, closed: bool, buffer: NDArray[np.float32]
 ) -> np.float32:
-    """Shift; what would be past an end of an open route is dropped. Returns the total that is left."""
+    """Write the shifted belief into the buffer, without what is past an end of an open route; returns its total."""
     n = belief.size
     if closed:
         shift %= n
-        moved[shift:] = belief[: n - shift]
-        moved[:shift] = belief[n - shift :]
+        buffer[shift:] = belief[: n - shift]
+        buffer[:shift] = belief[n - shift :]
     elif shift >= 0:
         shift = min(shift, n)
-        moved[:shift] = 0
-        moved[shift:] = belief[: n - shift]
-        if fraction > 0 and n > shift:  # the last cell's mass would be past the end
-            moved[n - 1] = 0
+        buffer[:shift] = 0
+        buffer[shift:] = belief[: n - shift]
+        if fraction > 0 and n > shift:  # the last cell's part would be past the end
+            buffer[n - 1] = 0
     else:
         shift = max(shift, -n)
-        moved[: n + shift] = belief[-shift:]
-        moved[n + shift :] = 0
+        buffer[: n + shift] = belief[-shift:]
+        buffer[n + shift :] = 0
     if fraction > 0:
-        last = moved[n - 1]
+        last = buffer[n - 1]
         for c in range(n - 1, 0, -1):
-            moved[c] += fraction * (moved[c - 1] - moved[c])
-        moved[0] += fraction * ((last if closed else np.float32(0.0)) - moved[0])
+            buffer[c] += fraction * (buffer[c - 1] - buffer[c])
+        buffer[0] += fraction * ((last if closed else np.float32(0.0)) - buffer[0])
     total = np.float32(0.0)
     for c in range(n):
-        total += moved[c]
+        total += buffer[c]
     return total
 
 
 @njit(cache=True, nogil=True)
-def _pad(moved: NDArray[np.float32], reach: int, n: int, taps: NDArray[np.float32], closed: bool) -> None:
-    """Make the ends ready for the blur: none of an open route's mass is blurred past its ends."""
+def _pad(buffer: NDArray[np.float32], reach: int, n: int, taps: NDArray[np.float32], closed: bool) -> None:
+    """Prepare the buffer's ends for the blur, which must lose no mass of an open route past its ends."""
     if reach == 0:
         return
     if closed:
-        moved[:reach] = moved[n : n + reach]
-        moved[reach + n : 2 * reach + n] = moved[reach : 2 * reach]
+        buffer[:reach] = buffer[n : n + reach]
+        buffer[reach + n : 2 * reach + n] = buffer[reach : 2 * reach]
         return
     for c in range(min(reach, n)):
-        moved[reach + c] /= _inside(taps, reach, c, n)
+        buffer[reach + c] /= _inside(taps, reach, c, n)
     for c in range(max(reach, n - reach), n):
-        moved[reach + c] /= _inside(taps, reach, c, n)
+        buffer[reach + c] /= _inside(taps, reach, c, n)
 
 
 @njit(cache=True, nogil=True)
 def _inside(taps: NDArray[np.float32], reach: int, cell: int, n: int) -> np.float32:
-    """The share of the blur of a cell that falls on the route."""
+    """Share of a cell's blur that falls on the route."""
     share = np.float32(0.0)
     for k in range(taps.size):
         if 0 <= cell + k - reach < n:
@@ -211,9 +212,9 @@ def _inside(taps: NDArray[np.float32], reach: int, cell: int, n: int) -> np.floa
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _blur(
-    moved: NDArray[np.float32], taps: NDArray[np.float32], scale: np.float32, belief: NDArray[np.float32]
+    buffer: NDArray[np.float32], taps: NDArray[np.float32], scale: np.float32, belief: NDArray[np.float32]
 ) -> None:
-    """Every cell's sum over its neighbours, a block of cells at a time."""
+    """Write the blurred buffer, times `scale`, into the belief, a block of cells at a time."""
     n = belief.size
     weights = np.zeros(-(-taps.size // _TAPS_AT_ONCE) * _TAPS_AT_ONCE, np.float32)
     weights[: taps.size] = taps * scale
@@ -223,7 +224,7 @@ def _blur(
         block[:] = 0
         for k in range(0, weights.size, _TAPS_AT_ONCE):
             w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
-            source = moved[start + k : stop + k + _TAPS_AT_ONCE - 1]
+            source = buffer[start + k : stop + k + _TAPS_AT_ONCE - 1]
             for c in range(block.size):
                 block[c] += w0 * source[c] + w1 * source[c + 1] + w2 * source[c + 2] + w3 * source[c + 3]
 
@@ -232,11 +233,11 @@ def _blur(
 def _see(
     belief: NDArray[np.float32], evidence: NDArray[np.float32], image_of_cell: NDArray[np.int32], additive: bool
 ) -> np.float32:
-    """Take the evidence of the cells' map images; returns the new total."""
+    """Update the belief in place by the evidence of the cells' map images; returns the new total."""
     total = np.float32(0.0)
     for c in range(belief.size):
-        seen = evidence[image_of_cell[c]]
-        belief[c] = belief[c] + seen if additive else belief[c] * seen
+        value = evidence[image_of_cell[c]]
+        belief[c] = belief[c] + value if additive else belief[c] * value
         total += belief[c]
     return total
 

@@ -1,12 +1,12 @@
-"""The durable form of the inverted index: the map images' lists in route order, coded without loss.
+"""The stored form of the inverted index: the map images' lists in route order, coded without loss.
 
-Neighbours see the same landmarks, and a list holds landmarks that are alike. So each place of a list says which place
-of the list before it repeats, by how often such places have done so, or names another landmark: the likelier, the more
-it is like those of the list before and those already in its own (the landmark model, which lies in the same file, tells
-how alike two are), and if it was listed a moment ago. An arithmetic coder turns these likelihoods into bits.
+Neighbours see the same landmarks, and a list holds landmarks that are alike. So each place of a list repeats a place of
+the list before, likelier the more often such places did, or names another landmark: the likelier, the more it is like
+those of the list before and those already in its own (by the landmark model, which is in the same file), and if it was
+listed a moment ago. An arithmetic coder turns these likelihoods into bits.
 
-Every block of 8,192 images is a stream of its own, and what was learnt goes on from block to block: appending images
-changes none but the last. All arithmetic is of integers, or rounded as IEEE 754 says, so every machine reads the same.
+Every block of 8,192 images is a stream of its own, and counts go on from block to block: appending images changes none
+but the last. All arithmetic is of integers, or rounded as IEEE 754 says, so every machine reads the same.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,16 +24,16 @@ BLOCK = 8192  # images
 _STATE_BITS, _TOTAL_BITS = 34, 28
 _LOW, _HIGH, _VALUE, _PENDING, _AT = range(5)  # of the coder's state
 
-# What was learnt: how often a place of a list repeats place k of the one before, or (k = h) none, by what the place
-# before it did, and whatever that did. Halved at so many, so that it follows the route.
+# Limits of the counts of how often a place of a list repeats place k of the list before, or none (k = h): given what
+# the place before it repeated, and in all. Counts are halved at the limit, so that they follow the route.
 _MOST_AFTER, _MOST_EVER = 1 << 10, 1 << 13
-_PRIOR = 5  # both of what is counted at the beginning, and of what the second counts beside the first
+_PRIOR = 5  # what every count in all begins at, and their weight beside the others
 
-# How much likeness counts, by place of the list, in 1/1024 of 1/16 bit: to the list before, to its own list so far.
+# Weight of a landmark's likeness to the list before and to its own list so far, by place, in 1/1024 of 1/16 bit.
 _TO_BEFORE, _TO_OWN = np.array([55, 32, 26, 16]), np.array([0, 110, 45, 32])
-_RECENT, _RECENT_PARTS = 32, 16  # listed within so many images, so many 1/16 bits likelier
-_MOST_ALIKE = 4096  # landmarks; of more no table of likeness is made
-_DIMENSIONS = 256  # of a prototype, spread evenly, that are compared
+_RECENT, _RECENT_PARTS = 32, 16  # a landmark listed in the last so many images is so many 1/16 bits likelier
+_MOST_ALIKE = 4096  # landmarks; for more no table of likeness is made
+_DIMENSIONS = 256  # numbers of a prototype, evenly spread, that are compared
 _PARTS = 16  # of a bit
 _POWERS = np.array(  # 2^(15 + i/16), rounded
     [32768, 34219, 35734, 37316, 38968, 40693, 42495, 44376, 46341, 48393, 50535, 52773, 55109, 57549, 60097, 62757]
@@ -41,21 +41,21 @@ _POWERS = np.array(  # 2^(15 + i/16), rounded
 
 
 def pack_lists(lists: NDArray[np.uint16], n_landmarks: int, prototypes: NDArray[Any] | None) -> list[bytes]:
-    """The blocks of landmark lists, [h, n].
+    """The coded blocks of landmark lists [h, n].
 
     Args:
         lists: Landmarks below `n_landmarks`.
         n_landmarks: r.
-        prototypes: [r, ...] of the landmark model; None: it has none.
+        prototypes: [r, ...] of the landmark model; None where it has none.
     """
     model = _Model(len(lists), n_landmarks, prototypes)
-    return [model.write(lists[:, at : at + BLOCK].copy()) for at in range(0, lists.shape[1], BLOCK)]
+    return [model.write(lists[:, start : start + BLOCK].copy()) for start in range(0, lists.shape[1], BLOCK)]
 
 
 def unpack_lists(
     blocks: Sequence[bytes], list_length: int, n_images: int, n_landmarks: int, prototypes: NDArray[Any] | None
 ) -> NDArray[np.uint16]:
-    """Back from `pack_lists`.
+    """[h, n] the lists from the blocks of `pack_lists`.
 
     Raises:
         ValueError: The blocks are not those of so many lists and of these landmarks.
@@ -63,31 +63,32 @@ def unpack_lists(
     if not 1 <= list_length <= n_landmarks or n_images < 1 or len(blocks) != -(-n_images // BLOCK):
         raise ValueError(f"{len(blocks)} blocks are not those of {n_images} lists of {list_length} landmarks")
     model = _Model(list_length, n_landmarks, prototypes)
-    sizes = (min(BLOCK, n_images - at) for at in range(0, n_images, BLOCK))
-    return np.concatenate([model.read(*each) for each in zip(blocks, sizes, strict=True)], axis=1)
+    sizes = (min(BLOCK, n_images - start) for start in range(0, n_images, BLOCK))
+    return np.concatenate([model.read(block, size) for block, size in zip(blocks, sizes, strict=True)], axis=1)
 
 
 class _Model:
-    """What makes a landmark likely at a place of a list, as far as the images before have taught it."""
+    """The likelihoods of landmarks at every place of a list, learnt from the images before."""
 
     def __init__(self, list_length: int, n_landmarks: int, prototypes: NDArray[Any] | None) -> None:
         h = list_length
         places = np.minimum(np.arange(h), len(_TO_OWN) - 1)
         shares = np.stack([np.rint(10 * list_weights(h)), _TO_BEFORE[places], _TO_OWN[places]])
         self._likeness = _likeness(n_landmarks, prototypes), shares.astype(np.int32)
-        after, ever = np.zeros((h, h + 1, h + 1), np.int64), np.full((h, h + 1), _PRIOR, np.int64)
-        seen = np.full(n_landmarks, -_RECENT - 1, np.int64)  # the last image that listed a landmark
-        before = np.full(h + 1, -1, np.int64)  # the list before, and which of its places the next one's first repeated
-        self._learnt = after, ever, seen, before
+        counts_after, counts = np.zeros((h, h + 1, h + 1), np.int64), np.full((h, h + 1), _PRIOR, np.int64)
+        last_images = np.full(n_landmarks, -_RECENT - 1, np.int64)  # the last image that listed a landmark
+        # The list before, and which place of the one before that its first place repeated
+        previous = np.full(h + 1, -1, np.int64)
+        self._learnt = counts_after, counts, last_images, previous
         self._n_images = 0
 
     def write(self, lists: NDArray[np.uint16]) -> bytes:
-        """The block of the next lists, [h, b]."""
+        """The coded block of the next lists [h, b]."""
         stream = np.zeros(8 * lists.size + 8, np.uint8)
         return stream[: self._coded(lists, stream, False)].tobytes()
 
     def read(self, block: bytes, n_images: int) -> NDArray[np.uint16]:
-        """The next lists from their block; raises ValueError where they take another number of bytes."""
+        """[h, b] the next lists from their block; raises ValueError where they take another number of bytes."""
         lists = np.zeros((self._learnt[0].shape[0], n_images), np.uint16)
         if self._coded(lists, np.frombuffer(block, np.uint8).copy(), True) != len(block):
             raise ValueError("a block of the index is damaged")
@@ -100,7 +101,7 @@ class _Model:
 
 
 def _likeness(n_landmarks: int, prototypes: NDArray[Any] | None) -> NDArray[np.int8]:
-    """[r, r] cosines of the landmarks' prototypes, less their mean, in 1/127; [0, 0] where they are not to be had.
+    """[r, r] cosines of the landmarks' prototypes less their mean, in 1/127; [0, 0] where there are no usable ones.
 
     Products of whole numbers this small are exact in float64, in whatever order they are summed.
     """
@@ -109,9 +110,9 @@ def _likeness(n_landmarks: int, prototypes: NDArray[Any] | None) -> NDArray[np.i
     rows = prototypes.reshape(n_landmarks, -1)
     rows = np.nan_to_num(rows[:, :: -(-rows.shape[1] // _DIMENSIONS)].astype(np.float64))
     greatest = np.abs(rows).max(axis=1, keepdims=True)
-    whole = np.rint(rows * (1023 / np.where(greatest > 0, greatest, 1.0)))
-    whole -= np.rint(whole.sum(axis=0) / n_landmarks)
-    products = whole @ whole.T
+    numbers = np.rint(rows * (1023 / np.where(greatest > 0, greatest, 1.0)))
+    numbers -= np.rint(numbers.sum(axis=0) / n_landmarks)
+    products = numbers @ numbers.T
     lengths = np.sqrt(np.maximum(np.diag(products), 1.0))
     return np.rint(127 * (products / lengths / lengths[:, np.newaxis])).astype(np.int8)
 
@@ -124,47 +125,48 @@ def _code(
     first: int,
     alike: NDArray[np.int8],
     shares: NDArray[np.int32],
-    after: NDArray[np.int64],
-    ever: NDArray[np.int64],
-    seen: NDArray[np.int64],
-    before: NDArray[np.int64],
+    counts_after: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    last_images: NDArray[np.int64],
+    previous: NDArray[np.int64],
 ) -> int:
-    """Write lists from image `first` on into the zeroed stream, or read them; returns the bytes it takes.
+    """Write lists from image `first` on into the zeroed stream, or read them from it; returns their number of bytes.
 
-    More than the stream has: it is not one of such lists.
+    A number beyond the stream's size says that the stream holds no such lists.
     """
-    (h, n), r = lists.shape, seen.size
+    (h, n), r = lists.shape, last_images.size
     powers, coder = _powers(r), _coder(stream, is_read)
-    toward, own, likely = np.zeros(r, np.int32), np.zeros(r, np.int32), np.zeros(r, np.int32)
+    previous_likeness, own_likeness, likely = np.zeros(r, np.int32), np.zeros(r, np.int32), np.zeros(r, np.int32)
     choice = np.zeros(h + 1, np.int32)
     for image in range(first, first + n):
         if coder[_AT] > 8 * stream.size + _STATE_BITS:
             return stream.size + 1
         row = lists[:, image - first]
-        earlier = before[:h] if before[0] >= 0 else before[:0]
-        _sum_alike(toward, alike, earlier, shares[0])
-        came = int(before[h])
-        before[h] = h
+        earlier = previous[:h] if previous[0] >= 0 else previous[:0]
+        _sum_alike(previous_likeness, alike, earlier, shares[0])
+        place_before = int(previous[h])
+        previous[h] = h
         for j in range(h):
             place = h
             if earlier.size:
-                _weigh_places(choice, row[:j], earlier, after[j, came], ever[j], r)
+                _weigh_places(choice, row[:j], earlier, counts_after[j, place_before], counts[j], r)
                 place = _symbol(choice, _place_of(row[j], earlier), coder, stream, is_read)
-                _count(after[j, came], place, _MOST_AFTER)
-                _count(ever[j], place, _MOST_EVER)
-                came = place
+                _count(counts_after[j, place_before], place, _MOST_AFTER)
+                _count(counts[j], place, _MOST_EVER)
+                place_before = place
                 if j == 0:
-                    before[h] = place
+                    previous[h] = place
             if place < h:
                 row[j] = earlier[place]
             else:
-                _sum_alike(own, alike, row[:j], shares[0])
-                _weigh_others(likely, shares[1, j] * toward + shares[2, j] * own, seen, image - _RECENT, powers)
-                likely[row[:j]] = 1  # twice in a list, which hardly anybody makes
+                _sum_alike(own_likeness, alike, row[:j], shares[0])
+                worth = shares[1, j] * previous_likeness + shares[2, j] * own_likeness
+                _weigh_others(likely, worth, last_images, image - _RECENT, powers)
+                likely[row[:j]] = 1  # a landmark twice in a list is all but impossible
                 likely[earlier] = 0
                 row[j] = _symbol(likely, int(row[j]), coder, stream, is_read)
-        before[:h] = row
-        seen[row] = image
+        previous[:h] = row
+        last_images[row] = image
     if is_read:
         return int(coder[_AT] - _STATE_BITS + 2 + 7) // 8
     coder[_PENDING] += 1
@@ -174,7 +176,7 @@ def _code(
 
 @njit(cache=True, nogil=True)
 def _powers(n_landmarks: int) -> NDArray[np.int32]:
-    """2^(i/16) as whole numbers, up to what so many landmarks may each have."""
+    """2^(i/16) as whole numbers, up to the greatest that each of so many landmarks may have."""
     n_bits = _TOTAL_BITS - 1
     while n_landmarks << n_bits >= 1 << _TOTAL_BITS:
         n_bits -= 1
@@ -186,7 +188,7 @@ def _powers(n_landmarks: int) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True)
 def _place_of(landmark: int, earlier: NDArray[np.int64]) -> int:
-    """The first place of a list that holds a landmark; its length where none does."""
+    """The first place of the list `earlier` that holds a landmark; its length where none does."""
     for place in range(earlier.size):
         if earlier[place] == landmark:
             return place
@@ -195,7 +197,7 @@ def _place_of(landmark: int, earlier: NDArray[np.int64]) -> int:
 
 @njit(cache=True, nogil=True)
 def _sum_alike(sums: NDArray[np.int32], alike: NDArray[np.int8], landmarks: Any, weights: NDArray[np.int32]) -> None:
-    """How much every landmark is like the weighted sum of some."""
+    """Write how much every landmark [r] is like the weighted sum of `landmarks`."""
     sums[:] = 0
     for place in range(landmarks.size if alike.size else 0):
         weight, of_landmark = weights[place], alike[landmarks[place]]
@@ -204,38 +206,38 @@ def _sum_alike(sums: NDArray[np.int32], alike: NDArray[np.int8], landmarks: Any,
 
 
 @njit(cache=True, nogil=True)
-def _weigh_others(likely: Any, worth: Any, seen: Any, recent: int, powers: Any) -> None:
-    """How likely each landmark is by what it is worth, the likeliest as much as may be."""
+def _weigh_others(likely: Any, worth: Any, last_images: Any, recent: int, powers: Any) -> None:
+    """Write how likely each landmark [r] is, by its worth and whether it was listed since image `recent`."""
     for other in range(likely.size):
-        likely[other] = (worth[other] >> 10) + (_RECENT_PARTS if seen[other] >= recent else 0)
-    least = likely.max() - powers.size + 1
+        likely[other] = (worth[other] >> 10) + (_RECENT_PARTS if last_images[other] >= recent else 0)
+    lowest = likely.max() - powers.size + 1
     for other in range(likely.size):
-        likely[other] = powers[max(0, likely[other] - least)]
+        likely[other] = powers[max(0, likely[other] - lowest)]
 
 
 @njit(cache=True, nogil=True)
-def _weigh_places(choice: Any, row: Any, earlier: Any, after: Any, ever: Any, n_landmarks: int) -> None:
-    """How likely the next landmark of a list is at each place of the list before, or (the last) at none."""
-    n_distinct, n_ever = 0, ever.sum()
+def _weigh_places(choice: Any, row: Any, earlier: Any, counts_after: Any, counts: Any, n_landmarks: int) -> None:
+    """Write how likely the next place of a list repeats each place of the list before, or, in the last number, none."""
+    n_distinct, n_counted = 0, counts.sum()
     for place in range(choice.size):
-        choice[place] = after[place] * n_ever + _PRIOR * ever[place]
+        choice[place] = counts_after[place] * n_counted + _PRIOR * counts[place]
     for place in range(earlier.size):
         if _place_of(earlier[place], earlier) < place:
             choice[place] = 0
             continue
         n_distinct += 1
-        for listed in row:
-            if listed == earlier[place]:
+        for landmark in row:
+            if landmark == earlier[place]:
                 choice[place] = 1
     if n_distinct == n_landmarks:
         choice[-1] = 0
 
 
 @njit(cache=True, nogil=True)
-def _count(counts: NDArray[np.int64], place: int, most: int) -> None:
-    """Count one more; all are halved, and what was counted stays above 0, where there are too many."""
+def _count(counts: NDArray[np.int64], place: int, limit: int) -> None:
+    """Count one more; at the limit all counts are halved, none of them to 0."""
     counts[place] += 1
-    if counts.sum() >= most:
+    if counts.sum() >= limit:
         for k in range(counts.size):
             counts[k] = (counts[k] + 1) >> 1
 
@@ -244,7 +246,7 @@ def _count(counts: NDArray[np.int64], place: int, most: int) -> None:
 def _symbol(
     shares: NDArray[np.int32], symbol: int, coder: NDArray[np.int64], stream: NDArray[np.uint8], is_read: bool
 ) -> int:
-    """Write a symbol, one of those whose likelihoods have these shares, or read one; returns it."""
+    """Write a symbol, or read one, by the shares of all symbols' likelihoods; returns it."""
     total, low = shares.sum(), coder[_LOW]
     span = coder[_HIGH] - low + 1
     below = np.int64(0)
@@ -262,27 +264,27 @@ def _symbol(
     quarter = half >> 1
     while True:
         if coder[_HIGH] < half:
-            taken = np.int64(0)
+            offset = np.int64(0)
         elif coder[_LOW] >= half:
-            taken = half
+            offset = half
         elif coder[_LOW] >= quarter and coder[_HIGH] < half + quarter:
-            taken = quarter
+            offset = quarter
         else:
             return symbol
         for bound in (_LOW, _HIGH, _VALUE):
-            coder[bound] = (coder[bound] - taken) << 1
+            coder[bound] = (coder[bound] - offset) << 1
         coder[_HIGH] |= 1
         if is_read:
             coder[_VALUE] |= _next_bit(coder, stream)
-        elif taken == quarter:
+        elif offset == quarter:
             coder[_PENDING] += 1
         else:
-            _write_bit(coder, stream, int(taken > 0))
+            _write_bit(coder, stream, int(offset > 0))
 
 
 @njit(cache=True, nogil=True)
 def _coder(stream: NDArray[np.uint8], is_read: bool) -> NDArray[np.int64]:
-    """The state at the beginning of a stream."""
+    """The coder's state at the beginning of a stream."""
     coder = np.zeros(5, np.int64)
     coder[_HIGH] = (1 << _STATE_BITS) - 1
     for _ in range(_STATE_BITS if is_read else 0):
@@ -292,24 +294,24 @@ def _coder(stream: NDArray[np.uint8], is_read: bool) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _next_bit(coder: NDArray[np.int64], stream: NDArray[np.uint8]) -> int:
-    """The next bit of the stream; behind its end 0."""
-    at = coder[_AT]
+    """The next bit of the stream; 0 behind its end."""
+    position = coder[_AT]
     coder[_AT] += 1
-    return (stream[at >> 3] >> (7 - (at & 7))) & 1 if at >> 3 < stream.size else 0
+    return (stream[position >> 3] >> (7 - (position & 7))) & 1 if position >> 3 < stream.size else 0
 
 
 @njit(cache=True, nogil=True)
 def _write_bit(coder: NDArray[np.int64], stream: NDArray[np.uint8], bit: int) -> None:
-    """Write a bit, and the opposite of it as often as was put off."""
-    for put_off in range(coder[_PENDING] + 1):
-        at = coder[_AT]
-        if bit != (put_off > 0):
-            stream[at >> 3] |= np.uint8(0x80 >> (at & 7))
+    """Write a bit, then its opposite as often as bits are pending."""
+    for i in range(coder[_PENDING] + 1):
+        position = coder[_AT]
+        if bit != (i > 0):
+            stream[position >> 3] |= np.uint8(0x80 >> (position & 7))
         coder[_AT] += 1
     coder[_PENDING] = 0
 
 
-# The index as releases before wrote it: posting lists packed below the byte. They are read, and no longer written.
+# The index as earlier releases wrote it, posting lists packed below the byte, which are still read.
 #
 # A posting list is the increasing ids of the map images that hold one landmark at one rank, written either as gaps or
 # as runs (gap, length). All numbers are Rice codes: the quotient in unary (zeros, then a one), then the low bits. The
@@ -318,11 +320,11 @@ def _write_bit(coder: NDArray[np.int64], stream: NDArray[np.uint8], bit: int) ->
 # Blob: one header byte, then the bit stream, most significant bit first. The header's low five bits are the Rice
 # parameter of the gaps; its high three bits are 0 for plain gaps, else 1 + the Rice parameter of the run lengths.
 
-_EMPTY = np.uint16(0xFFFF)  # no landmark: ids stay below it (see Map)
+_EMPTY = np.uint16(0xFFFF)  # no landmark; ids are less (see Map)
 
 
 def unpack_postings(postings: Iterable[tuple[int, int, bytes]], list_length: int, n_images: int) -> NDArray[np.uint16]:
-    """The landmark lists, [h, n], from posting lists: landmark from 0, rank from 1, blob.
+    """[h, n] the landmark lists from posting lists, each (landmark from 0, rank from 1, blob).
 
     Raises:
         ValueError: A map image is listed twice at a rank, missing from one, or out of range.
@@ -342,20 +344,20 @@ def unpack_postings(postings: Iterable[tuple[int, int, bytes]], list_length: int
 
 
 @njit(cache=True, nogil=True)
-def _read_rice(stream: NDArray[np.uint8], at: int, parameter: int) -> tuple[int, int]:
-    """Read one number from bit `at`; returns it and the next bit, or -1 where the stream holds no more."""
+def _read_rice(stream: NDArray[np.uint8], position: int, parameter: int) -> tuple[int, int]:
+    """Read one number from bit `position`; returns it and the next position, or -1 where the stream holds no more."""
     n_bits = stream.size * 8
     number = 0
-    while at < n_bits and not (stream[at >> 3] >> (7 - (at & 7))) & 1:
+    while position < n_bits and not (stream[position >> 3] >> (7 - (position & 7))) & 1:
         number += 1
-        at += 1
-    at += 1
-    if at + parameter > n_bits:
+        position += 1
+    position += 1
+    if position + parameter > n_bits:
         return -1, n_bits
     for _ in range(parameter):
-        number = (number << 1) | ((stream[at >> 3] >> (7 - (at & 7))) & 1)
-        at += 1
-    return number, at
+        number = (number << 1) | ((stream[position >> 3] >> (7 - (position & 7))) & 1)
+        position += 1
+    return number, position
 
 
 @njit(cache=True, nogil=True)
@@ -364,16 +366,16 @@ def _place(blob: NDArray[np.uint8], column: NDArray[np.uint16], landmark: int, e
     parameter = int(blob[0]) & 31
     run_parameter = (int(blob[0]) >> 5) - 1
     stream = blob[1:]
-    at, image, n_placed = 0, -1, 0
+    position, image, n_placed = 0, -1, 0
     if run_parameter >= 0:
         image = -2
     while True:
-        gap, at = _read_rice(stream, at, parameter)
+        gap, position = _read_rice(stream, position, parameter)
         if gap < 0:
             return n_placed
         length = 0
         if run_parameter >= 0:
-            length, at = _read_rice(stream, at, run_parameter)
+            length, position = _read_rice(stream, position, run_parameter)
             if length < 0:
                 return -1 - column.size
             image += 1

@@ -14,16 +14,16 @@ from deepsimbad.core.relevance import LiveStatistics, Query, Relevance
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 _BLOCK = 4096  # images whose sums stay in the first-level cache
-_IMAGES_WORTH_A_THREAD = 250_000  # below, waking a second core costs more than it saves
-_SCAN_UP_TO = 64  # a longer shortlist is sorted whole
-_SCAN_BLOCK = 256  # values that are looked at in one vectorised sweep
+_IMAGES_WORTH_A_THREAD = 250_000  # with fewer, waking a second core costs more than it saves
+_SCAN_UP_TO = 64  # for a longer shortlist all values are sorted
+_SCAN_BLOCK = 256  # values that are compared in one vectorised sweep
 
 
 def relevances(map_: Map, query: Query, live: LiveStatistics | None = None) -> NDArray[np.float32]:
-    """[n] relevance of every map image, larger is better, and 0 to a view that shows nothing; of a batch [e, n].
+    """[n] float32, relevance of every map image, larger is better; 0 of a view that shows nothing. Of a batch [e, n].
 
     Args:
-        live: A session's own statistics, in place of the map's; of a batch ranks alone, [e, r].
+        live: A session's own statistics, in place of the map's; for a batch those of ranks alone, [e, r].
 
     Raises:
         InvalidInputError: The query lacks what the map's relevance compares.
@@ -34,15 +34,15 @@ def relevances(map_: Map, query: Query, live: LiveStatistics | None = None) -> N
 
 
 def _standardised(map_: Map, query: Query, live: LiveStatistics | None) -> NDArray[np.float32]:
-    """Sum of -z over the list: a landmark counts by how unusually near it is."""
-    usual = live or map_.live_statistics
-    if usual is None:
+    """[n] sum of -z over the list, so that a landmark counts by how unusually near it is; of a batch [e, n]."""
+    statistics = live or map_.live_statistics
+    if statistics is None:
         raise InvalidMapConfigError("the map has no landmark statistics")
-    return _sum_listed_alike(map_, -usual.ranks.view(query.ranks).z)
+    return _sum_listed_alike(map_, -statistics.ranks.view(query.ranks).z)
 
 
 def _composed(map_: Map, query: Query, live: LiveStatistics | None) -> NDArray[np.float32]:
-    """Cosine of a view with the weighted sum of every image's landmarks."""
+    """[n] cosine of a view with the weighted sum of every image's landmarks; of a batch [e, n]."""
     products = products_with_landmarks(map_, query, live)
     tables = list_weights(map_.list_length)[:, np.newaxis] * products[..., np.newaxis, :]
     sums = sum_listed(map_, tables)
@@ -51,59 +51,62 @@ def _composed(map_: Map, query: Query, live: LiveStatistics | None) -> NDArray[n
 
 
 def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None = None) -> NDArray[np.float32]:
-    """[..., r] products of a view's unit encoding with the landmarks: from its encoding, else as near as can be told.
+    """[..., r] float32, products of a view's unit encoding with the landmarks: from its encoding, else estimated.
 
-    What was measured on board was standardised by the map's statistics: a session moves and scales every landmark's
-    product by what is usual for it live. Of ranks alone the normal scores stand for products.
+    Dissimilarities from on board are by the map's statistics, so a session standardises every landmark's product by its
+    own views, and brings it back to the map's. Of ranks alone the normal scores stand in for products.
 
     Args:
         live: A session's own statistics; None: the map's.
     """
-    of_map = map_.live_statistics
-    if of_map is None or of_map.encodings is None or of_map.products is None:
+    map_statistics = map_.live_statistics
+    if map_statistics is None or map_statistics.encodings is None or map_statistics.products is None:
         raise InvalidMapConfigError("the map does not know what is usual for encodings")
-    usual, products = live or of_map, query.products
-    # By the map's statistics the dissimilarities are already what the encoding would come to.
+    statistics, products = live or map_statistics, query.products
+    # By the map's statistics the dissimilarities are already those of the encoding.
     if query.encoding is not None and (live is not None or products is None):
-        if query.encoding.shape[-1] != of_map.encodings.mean.size:
-            d = of_map.encodings.mean.size
+        if query.encoding.shape[-1] != map_statistics.encodings.mean.size:
+            d = map_statistics.encodings.mean.size
             raise InvalidInputError(f"an encoding of {query.encoding.shape[-1]} numbers; the map's have {d}")
         model = map_.landmark_model
-        u = unit_encodings(query.encoding, usual.encodings or of_map.encodings, model.get("projection"))
+        u = unit_encodings(query.encoding, statistics.encodings or map_statistics.encodings, model.get("projection"))
         return np.asarray(u @ model["prototypes"].T, np.float32)
     if products is None:
-        return np.asarray(of_map.products.mean - of_map.products.std * usual.ranks.view(query.ranks).z, np.float32)
+        return np.asarray(
+            map_statistics.products.mean - map_statistics.products.std * statistics.ranks.view(query.ranks).z,
+            np.float32,
+        )
     if live is None or live.products is None:
         return products
     z = (products - live.products.mean) / live.products.std
-    return np.asarray(of_map.products.mean + of_map.products.std * z, np.float32)
+    return np.asarray(map_statistics.products.mean + map_statistics.products.std * z, np.float32)
 
 
 def _rrf(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
-    """Inner product of reciprocal rank features; the query keeps all r ranks, the map image h."""
+    """[n] inner product of reciprocal rank features, of the query's r ranks and the image's h; of a batch [e, n]."""
     reciprocal = 1.0 / np.arange(1, map_.list_length + 1)
     return sum_listed(map_, reciprocal[:, np.newaxis] * (1.0 / query.ranks.astype(np.float64))[..., np.newaxis, :])
 
 
 def _bag_of_landmarks(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
-    """How many landmarks the two lists of h share."""
+    """[n] number of landmarks that the h nearest of the view share with a map image's list; of a batch [e, n]."""
     return _sum_listed_alike(map_, query.ranks <= map_.list_length)
 
 
 def _simbad(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
-    """-L2 between h-hot dissimilarity vectors, `|q - m|^2 = |q|^2 + sum over the list of (q_i - m_i)^2 - q_i^2`."""
+    """[n] -L2 between h-hot dissimilarities, `|q - m|^2 = |q|^2 + sum over the list of (q_i - m_i)^2 - q_i^2`."""
     if query.dissimilarities is None or map_.values is None:
         raise InvalidInputError("a simbad map compares dissimilarities; ranks alone cannot answer it")
     if query.ranks.ndim > 1:  # one after the other: [e, h, n] numbers would be too many
         return np.stack([_simbad(map_, query.at(row), None) for row in range(len(query.ranks))])
     h_hot = np.where(query.ranks <= map_.list_length, query.dissimilarities, 0.0).astype(np.float64)
-    listed = h_hot[map_.lists]  # [h, n]
-    squared = np.square(h_hot).sum() + (np.square(listed - map_.values) - np.square(listed)).sum(axis=0)
+    values = h_hot[map_.lists]  # [h, n]
+    squared = np.square(h_hot).sum() + (np.square(values - map_.values) - np.square(values)).sum(axis=0)
     return np.asarray(-np.sqrt(np.maximum(squared, 0.0)), np.float32)
 
 
 def _brute_force(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
-    """-L2 between encodings, by one matrix product."""
+    """[n] -L2 between encodings, by one matrix product; of a batch [e, n]."""
     encodings = map_.encodings
     if query.encoding is None or encodings is None:
         raise InvalidInputError("a brute_force map compares encodings; send an image or an encoding")
@@ -128,20 +131,20 @@ _RULES: dict[Relevance, Callable[[Map, Query, LiveStatistics | None], NDArray[np
 
 
 def _sum_listed_alike(map_: Map, worth: NDArray[np.generic]) -> NDArray[np.float32]:
-    """`sum_listed` of landmarks that are worth the same at every rank, [..., r]."""
+    """`sum_listed` of landmarks whose worth [..., r] is the same at every rank."""
     tables = np.empty((*worth.shape[:-1], map_.list_length, worth.shape[-1]), np.float32)
     tables[...] = worth[..., np.newaxis, :]
     return sum_listed(map_, tables)
 
 
 def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
-    """Sum over every map image's list what a view gives each landmark at each rank.
+    """[n] float32, sum over every map image's list of a view's worth of the landmark at each rank; of a batch [e, n].
 
     The paper's inverted index walks the posting lists of a view's landmarks. Since a view keeps all r ranks, every
     posting takes part in every query, so memory holds the same postings sorted by map image.
 
     Args:
-        tables: [h, r], what landmark i is worth at rank j + 1; of a batch of views [e, h, r], which gives [e, n].
+        tables: [h, r], the worth of landmark i at rank j + 1; of a batch of views [e, h, r].
     """
     (h, n), r = map_.lists.shape, map_.n_landmarks
     if tables.shape[-2:] != (h, r):
@@ -181,7 +184,7 @@ def _second_core() -> ThreadPoolExecutor:
 
 
 def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
-    """The ids [length, at most n] of the greatest values [n], best first, ties by id; of a batch [e, n] [e, length]."""
+    """Ids [length, at most n] of the greatest values [n], best first, ties by id; of a batch [e, n] -> [e, length]."""
     if length > _SCAN_UP_TO:
         return np.argsort(-values, axis=-1, kind="stable")[..., :length].astype(np.int64)
     rows = np.ascontiguousarray(values).reshape(-1, values.shape[-1])
@@ -191,16 +194,16 @@ def shortlist(values: NDArray[np.floating], length: int) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _count_above(block: NDArray[np.floating], threshold: float) -> int:
-    """How many values are greater. Counting vectorises where an early exit would not."""
+    """How many values are above the threshold; counting vectorises where an early exit would not."""
     count = 0
-    for place in range(block.size):
-        count += block[place] > threshold
+    for i in range(block.size):
+        count += block[i] > threshold
     return count
 
 
 @njit(cache=True, nogil=True)
 def _scan(rows: NDArray[np.floating], length: int) -> NDArray[np.int64]:
-    """One pass over every row that keeps the best so far in order; a block with nothing better is passed over whole."""
+    """[e, length] ids of the greatest values of rows [e, n], in one pass that skips blocks of lesser ones."""
     bests = np.empty((len(rows), length), np.int64)
     for view in range(len(rows)):
         values, best = rows[view], bests[view]
@@ -213,10 +216,10 @@ def _scan(rows: NDArray[np.floating], length: int) -> NDArray[np.int64]:
                 value = values[candidate]
                 if n_kept == length and not value > values[best[length - 1]]:
                     continue
-                place = min(n_kept, length - 1)
-                while place > 0 and value > values[best[place - 1]]:
-                    best[place] = best[place - 1]
-                    place -= 1
-                best[place] = candidate
+                rank = min(n_kept, length - 1)
+                while rank > 0 and value > values[best[rank - 1]]:
+                    best[rank] = best[rank - 1]
+                    rank -= 1
+                best[rank] = candidate
                 n_kept = min(n_kept + 1, length)
     return bests
