@@ -37,8 +37,8 @@ class Exchange:
     async def send(self, message):
         self.answers.append(message)
 
-    def came(self, n_bytes, more=False):
-        self.incoming.put_nowait({"type": "http.request", "body": bytes(n_bytes), "more_body": more})
+    def push(self, n_bytes, has_more=False):
+        self.incoming.put_nowait({"type": "http.request", "body": bytes(n_bytes), "more_body": has_more})
 
     @property
     def status(self):
@@ -92,22 +92,26 @@ class Asker:
         self.door = Door(application, Settings(data_dir=Path("none"), **{**LIMITS, **settings}), keys, Metrics())
         self.tasks = []
 
-    async def ask(self, path="/v1/domains", method="GET", n_declared=None, **more):
+    async def ask(self, path="/v1/domains", method="GET", n_declared=None, **more_headers):
         """Send a head; a request without a body is whole by that."""
-        headers = {"host": "127.0.0.1", **({} if n_declared is None else {"content-length": str(n_declared)}), **more}
-        sent = [(name.replace("_", "-").encode(), value.encode("latin-1")) for name, value in headers.items()]
-        scope = {"type": "http", "method": method, "path": path, "raw_path": path.encode(), "headers": sent}
+        headers = {
+            "host": "127.0.0.1",
+            **({} if n_declared is None else {"content-length": str(n_declared)}),
+            **more_headers,
+        }
+        raw_headers = [(name.replace("_", "-").encode(), value.encode("latin-1")) for name, value in headers.items()]
+        scope = {"type": "http", "method": method, "path": path, "raw_path": path.encode(), "headers": raw_headers}
         exchange = scope["exchange"] = Exchange(scope)
         exchange.may_end.set()
-        if n_declared is None and not {"transfer_encoding", "content_length"} & set(more):
-            exchange.came(0)
+        if n_declared is None and not {"transfer_encoding", "content_length"} & set(more_headers):
+            exchange.push(0)
         self.tasks.append(asyncio.ensure_future(self.door(scope, exchange.incoming.get, exchange.send)))
         await settle()
         return exchange
 
-    async def answered(self, path="/v1/domains", method="GET", **more):
+    async def answered(self, path="/v1/domains", method="GET", **options):
         """Ask, and let the application answer."""
-        exchange = await self.ask(path, method, **more)
+        exchange = await self.ask(path, method, **options)
         exchange.may_answer.set()
         await settle()
         return exchange
@@ -149,7 +153,7 @@ async def test_bodies_on_their_way_and_answers_read_slowly_take_nobodys_turn():
     door = Asker()
     slow = [await door.ask(method="PUT", n_declared=100) for _ in range(10)]
     for exchange in slow:
-        exchange.came(10, more=True)
+        exchange.push(10, has_more=True)
     for _ in range(3):
         reader = await door.ask()
         reader.may_end.clear()
@@ -157,7 +161,7 @@ async def test_bodies_on_their_way_and_answers_read_slowly_take_nobodys_turn():
         await settle()
         assert (reader.status, door.in_use[0]) == (200, 0)
     for exchange in slow:  # all are whole at once: two are done, the others come back later
-        exchange.came(90)
+        exchange.push(90)
     await settle()
     assert [exchange.status for exchange in slow] == [None] * 2 + [503] * 8
     assert slow[2].limit == "max_requests"
@@ -168,7 +172,7 @@ async def test_bodies_that_fill_the_memory():
     door = Asker(max_requests=10)
     first = await door.ask(method="PUT", transfer_encoding="chunked")
     for n_bytes, n_held in ((FREE_BYTES, 0), (300, 300), (300, 600)):
-        first.came(n_bytes, more=True)
+        first.push(n_bytes, has_more=True)
         await settle()
         assert door.in_use[1] == n_held
     # One that says that it will not fit is refused before a byte of it ...
@@ -177,19 +181,19 @@ async def test_bodies_that_fill_the_memory():
     # ... one that fits takes its room as it comes, and small ones always fit.
     fits = await door.ask(method="PUT", n_declared=FREE_BYTES + 400)
     small = await door.ask(method="PUT", n_declared=FREE_BYTES)
-    small.came(FREE_BYTES)
+    small.push(FREE_BYTES)
     assert door.in_use[1] == 600
     # What comes in chunks is refused by the chunk that is too much.
     chunked = await door.ask(method="PUT", transfer_encoding="chunked")
-    chunked.came(FREE_BYTES + 400, more=True)
+    chunked.push(FREE_BYTES + 400, has_more=True)
     await settle()
     assert chunked.status is None
-    chunked.came(1, more=True)
+    chunked.push(1, has_more=True)
     await settle()
     assert (chunked.limit, door.in_use[1]) == ("max_body_memory_bytes", 600)
     # A batch goes to the disk.
     batch = await door.ask(BATCH, "POST", n_declared=10_000_000)
-    batch.came(10_000_000)
+    batch.push(10_000_000)
     await settle()
     assert (batch.status, door.in_use[1]) == (None, 600)
     for exchange in (first, fits):
@@ -204,7 +208,7 @@ async def test_bodies_that_fill_the_memory():
 async def test_nothing_is_kept_by_what_breaks_or_is_cancelled():
     door = Asker()
     broken = await door.ask("/breaks", method="PUT", n_declared=FREE_BYTES + 5)
-    broken.came(FREE_BYTES + 5)
+    broken.push(FREE_BYTES + 5)
     cancelled = await door.ask(BATCH, "POST", n_declared=5)
     await settle()
     door.tasks[1].cancel()
@@ -223,7 +227,7 @@ async def test_a_body_at_the_limit_passes_and_one_over_it_is_refused_at_the_byte
         exchange = await door.ask(method="POST", transfer_encoding="chunked")
         exchange.may_answer.set()
         for place, n_bytes in enumerate(sizes, 1):
-            exchange.came(n_bytes, more=place < len(sizes))
+            exchange.push(n_bytes, has_more=place < len(sizes))
         await settle()
         assert exchange.status == status
     assert exchange.n_read == 100
@@ -279,7 +283,7 @@ async def test_scopes(catalog):
     refused = await door.ask("/v1/admin/jobs", authorization=bearer(robot))
     assert refused.problem(403, "forbidden")["needed"] == "admin"
     unread = await door.ask("/v1/admin/domains/a", "PUT", n_declared=1000, x_api_key="dsk_x")
-    unread.came(1000)
+    unread.push(1000)
     unread.problem(401, "unauthorized")
     assert (unread.n_read, unread.incoming.qsize(), unread.headers["www-authenticate"]) == (0, 1, "Bearer")
     assert (await door.answered("/healthz")).status == 200

@@ -1,4 +1,4 @@
-"""Keys: what a request may carry, what the ring makes of it; rates, on a clock of our own."""
+"""Keys in requests, the ring that checks them, and rates on a clock of the test's own."""
 
 import asyncio
 import time
@@ -27,7 +27,7 @@ BEARER, BASIC, OWN = (
 
 
 @pytest.mark.parametrize(
-    ("headers", "why"),
+    ("headers", "complaint"),
     [
         ([BEARER], None),
         ([(b"authorization", b"bEaReR   " + KEY + b"  ")], None),
@@ -46,11 +46,11 @@ BEARER, BASIC, OWN = (
         ([(b"authorization", "Bearer ключ".encode())], "malformed"),
     ],
 )
-def test_a_request_carries_one_key(headers, why):
-    if why is None:
+def test_a_request_carries_one_key(headers, complaint):
+    if complaint is None:
         assert presented_key({"headers": headers}) == KEY.decode()
         return
-    with pytest.raises(UnauthorizedError, match=why):
+    with pytest.raises(UnauthorizedError, match=complaint):
         presented_key({"headers": headers})
 
 
@@ -79,23 +79,23 @@ def test_a_ring_without_keys_is_open_until_the_first_and_closed_for_good(catalog
 
 
 def test_who_shares_the_keys_is_told_of_a_change_before_it_counts_here(catalog):
-    ring, told = ring_of(catalog), []
+    ring, n_keys = ring_of(catalog), []
 
     async def announce():
-        told.append(len(ring.by_id))
+        n_keys.append(len(ring.by_id))
 
     ring.announce = announce
     for _ in range(2):
         catalog.create_key(KeyScope.LOCALIZE)
         for _ in range(2):
             asyncio.run(ring.reread())
-    assert (told, len(ring.by_id)) == ([0, 1], 2)
+    assert (n_keys, len(ring.by_id)) == ([0, 1], 2)
 
 
 def test_what_is_not_a_key_of_ours(catalog):
     record, key = catalog.create_key(KeyScope.ADMIN)
     ring = ring_of(catalog)
-    for text, why in (
+    for text, complaint in (
         (ApiKey(record.key_id, ApiKey.new().secret).text, "not known"),
         (ApiKey.new().text, "not known"),
         (f"dsk_{record.key_id}_{record.secret_sha256[:43]}", "not known"),
@@ -105,7 +105,7 @@ def test_what_is_not_a_key_of_ours(catalog):
         ("x" * 100_000, "malformed"),
         (record.secret_sha256, "malformed"),
     ):
-        with pytest.raises(UnauthorizedError, match=why) as caught:
+        with pytest.raises(UnauthorizedError, match=complaint) as caught:
             ring.holder(text)
         assert caught.value.hints == {}, "only its holder learns more"
 
@@ -122,20 +122,20 @@ def test_an_expired_key(catalog):
 def test_every_key_is_compared_known_or_not(catalog, monkeypatch):
     record, key = catalog.create_key(KeyScope.ADMIN)
     ring, unknown = ring_of(catalog), ApiKey.new()
-    compared = []
+    comparisons = []
     compare_digest = keys.hmac.compare_digest
 
-    def watched(given, kept):
-        compared.append((given, kept))
-        return compare_digest(given, kept)
+    def watched(sent_digest, stored_digest):
+        comparisons.append((sent_digest, stored_digest))
+        return compare_digest(sent_digest, stored_digest)
 
     monkeypatch.setattr(keys.hmac, "compare_digest", watched)
     with pytest.raises(UnauthorizedError):
         ring.holder(unknown.text)
     ring.holder(key.text)
-    assert [given for given, _ in compared] == [unknown.secret_sha256, key.secret_sha256]
-    assert {len(kept) for _, kept in compared} == {64}
-    assert compared[1][1] == record.secret_sha256
+    assert [sent_digest for sent_digest, _ in comparisons] == [unknown.secret_sha256, key.secret_sha256]
+    assert {len(stored_digest) for _, stored_digest in comparisons} == {64}
+    assert comparisons[1][1] == record.secret_sha256
 
 
 @pytest.mark.parametrize("has_key", [True, False])

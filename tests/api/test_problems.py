@@ -71,13 +71,13 @@ def test_hints_that_json_cannot_hold_still_travel():
 
 
 def test_what_may_be_tried_again_says_when():
-    for error, after in (
+    for error, retry_after in (
         (errors.UnavailableError("x"), "5"),
         (errors.BusyError("x"), "5"),
         (errors.BusyError("x", retry_after_s=17), "17"),
         (errors.ConflictError("x"), None),
     ):
-        assert error_response(SCOPE, error).headers.get("retry-after") == after
+        assert error_response(SCOPE, error).headers.get("retry-after") == retry_after
 
 
 def test_a_503_is_logged_with_its_request_and_with_a_stack_where_something_stands_behind_it(caplog):

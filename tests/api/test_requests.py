@@ -39,21 +39,21 @@ async def test_a_long_body_is_read_in_a_thread(running, n_blanks, monkeypatch):
 
 
 async def test_a_body_of_too_many_numbers_is_refused_before_it_is_parsed(running):
-    most = b'{"encoding":[' + b"1," * (MAX_NUMBERS - 1) + b"1%s]}"
-    assert len((await parse_json(most % b"", FrameBody, running)).encoding) == MAX_NUMBERS
+    body = b'{"encoding":[' + b"1," * (MAX_NUMBERS - 1) + b"1%s]}"
+    assert len((await parse_json(body % b"", FrameBody, running)).encoding) == MAX_NUMBERS
     with pytest.raises(InvalidRequestError, match="numbers"):
-        await parse_json(most % b",1", FrameBody, running)
+        await parse_json(body % b",1", FrameBody, running)
 
 
 @pytest.mark.parametrize(
     ("query", "headers"),
     [
         ("", []),
-        ("metres=3&most=7", [("Word", "w-1")]),
+        ("metres=3&count=7", [("Word", "w-1")]),
         ("metres=1e3&metres=-2.5", [("word", "first"), ("WORD", "second")]),
-        ("metres=%20%201&most=", []),
-        ("metres=nan&most=0", []),
-        ("most=5.0", [("Word", "é".encode())]),
+        ("metres=%20%201&count=", []),
+        ("metres=nan&count=0", []),
+        ("count=5.0", [("Word", "é".encode())]),
         ("metres=true", [("Word", "")]),
         ("word=w&Word=w", []),
         ("metres=1_0", [("Word", " ")]),
@@ -65,10 +65,10 @@ async def test_a_quick_route_takes_and_refuses_what_the_framework_does(query, he
         request: Request,
         name: Annotated[str, Path(pattern="^[a-z ]+$")],
         metres: Annotated[float, Query()] = 0.5,
-        most: Annotated[int | None, Query(ge=1)] = None,
+        count: Annotated[int | None, Query(ge=1)] = None,
         word: Annotated[Annotated[str, Field(pattern="^[!-~]+$")] | None, Header(alias="Word")] = None,
     ) -> JSONResponse:
-        return JSONResponse(repr([name, metres, most, word]))
+        return JSONResponse(repr([name, metres, count, word]))
 
     answers = []
     for kind in (StrictRoute, QuickRoute):

@@ -33,10 +33,11 @@ def test_a_data_directory_that_is_none(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("host", "why"), [("192.0.2.1", "assign requested address"), ("no.such.host.invalid", r"name|resolution|service")]
+    ("host", "reason"),
+    [("192.0.2.1", "assign requested address"), ("no.such.host.invalid", r"name|resolution|service")],
 )
-def test_an_address_that_is_not_ours(tmp_path, host, why):
-    with pytest.raises(UnavailableError, match=f"cannot listen on {host}:0: .*(?i:{why})"):
+def test_an_address_that_is_not_ours(tmp_path, host, reason):
+    with pytest.raises(UnavailableError, match=f"cannot listen on {host}:0: .*(?i:{reason})"):
         serve(Settings(data_dir=tmp_path, host=host, port=0, allow_open=True))
 
 

@@ -24,7 +24,7 @@ def _empty_environment(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "name"),
+    ("flags", "name"),
     [
         ({"port": 70_000}, "port"),
         ({"max_pixels": 0}, "max_pixels"),
@@ -35,9 +35,9 @@ def _empty_environment(monkeypatch, tmp_path):
         ({"colour": "red"}, "colour"),
     ],
 )
-def test_a_wrong_setting_is_named(given, name):
+def test_a_wrong_setting_is_named(flags, name):
     with pytest.raises(SettingsError, match=rf"{name}.*the command line") as caught:
-        trace_settings(**given)
+        trace_settings(**flags)
     assert caught.value.hints == {"setting": name}
 
 
@@ -77,7 +77,7 @@ def test_the_file_is_that_of_the_flag_the_environment_or_here(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("content", "why"),
+    ("content", "complaint"),
     [
         (b"prot = 1", "no setting 'prot', which stands in bad.toml: did you mean 'port'"),
         (b"[server]\nport = 1", "no setting 'server', which stands in bad.toml"),
@@ -87,9 +87,9 @@ def test_the_file_is_that_of_the_flag_the_environment_or_here(monkeypatch):
         (b"host = '\xff'", "bad.toml is not TOML"),
     ],
 )
-def test_a_wrong_file_is_named_with_what_is_wrong(content, why):
+def test_a_wrong_file_is_named_with_what_is_wrong(content, complaint):
     Path("bad.toml").write_bytes(content)
-    with pytest.raises(SettingsError, match=why):
+    with pytest.raises(SettingsError, match=complaint):
         trace_settings(Path("bad.toml"))
 
 
@@ -125,12 +125,12 @@ def test_other_addresses_are_refused_without_keys(host, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "why"), [({"host": "::"}, "without keys"), ({"require_keys": True}, "require_keys is set")]
+    ("settings", "complaint"), [({"host": "::"}, "without keys"), ({"require_keys": True}, "require_keys is set")]
 )
-def test_a_folder_without_keys_is_refused_where_they_are_needed(tmp_path, settings, why):
+def test_a_folder_without_keys_is_refused_where_they_are_needed(tmp_path, settings, complaint):
     app = create_app(Settings(data_dir=tmp_path, **settings))
     with Catalog.open(tmp_path) as catalog:
-        with pytest.raises(SettingsError, match=why), TestClient(app):
+        with pytest.raises(SettingsError, match=complaint), TestClient(app):
             pass
         record, _ = catalog.create_key(KeyScope.ADMIN)
         catalog.revoke_key(record.key_id)  # all revoked: it may start, for it is closed

@@ -34,10 +34,10 @@ TTL_S, KEEP_ENDED_S = 100.0, 50_000.0
 
 class Clock:
     def __init__(self) -> None:
-        self.now = 1_000_000.0
+        self.now_s = 1_000_000.0
 
     def __call__(self) -> float:
-        return self.now
+        return self.now_s
 
 
 @pytest.fixture
@@ -52,8 +52,8 @@ def map_contents(
     encodings = rng.normal(size=(N_IMAGES, DIM)).astype(np.float32)
     evaluator = FeatureL2("none")
     model = evaluator.fit_landmarks(rng.normal(size=(N_LANDMARKS, DIM)).astype(np.float32))
-    measured = evaluator.dissimilarities(encodings, model)
-    drive = Drive(position_m=np.arange(N_IMAGES) * 1.5, encodings=encodings, dissimilarities=measured)
+    dissimilarities = evaluator.dissimilarities(encodings, model)
+    drive = Drive(position_m=np.arange(N_IMAGES) * 1.5, encodings=encodings, dissimilarities=dissimilarities)
     if relevance is Relevance.COMPOSED:
         plan = MapPlan(relevance, LIST_LENGTH, (1.0, 2.0), closed)
         map_ = compose_map(plan, drive, None, None, N_LANDMARKS).map
@@ -84,12 +84,12 @@ def add_domain(catalog: Catalog, name: str, closed: bool = False) -> None:
 
 @pytest.fixture
 def catalog(tmp_path: Path) -> Iterator[Catalog]:
-    with Catalog.open(tmp_path) as opened:
-        yield opened
+    with Catalog.open(tmp_path) as empty_catalog:
+        yield empty_catalog
 
 
 @pytest.fixture
-def mapped(catalog: Catalog) -> Catalog:
+def mapped_catalog(catalog: Catalog) -> Catalog:
     """One domain, d, with its first map."""
     add_domain(catalog, "d")
     add_map(catalog)
@@ -141,8 +141,8 @@ def viewed(view: View) -> Callable[[Evaluator, Map], Awaitable[tuple[View, Seque
 
 def ranked(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d") -> Observation:
     ids = np.random.default_rng(seed).permutation(N_LANDMARKS)[: 1 + seed % N_LANDMARKS]
-    named = None if key is None else IdempotencyKey(key, digest)
-    return Observation(viewed(RankedLandmarks(tuple(ids.tolist()))), action_m, idempotency=named)
+    idempotency = None if key is None else IdempotencyKey(key, digest)
+    return Observation(viewed(RankedLandmarks(tuple(ids.tolist()))), action_m, idempotency=idempotency)
 
 
 def encoded(seed: int, action_m: float = 1.5) -> Observation:

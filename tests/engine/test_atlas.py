@@ -1,4 +1,4 @@
-"""Parts of an answer that different processes have asked for."""
+"""One view on many domains, answered in parts by different processes."""
 
 import numpy as np
 
@@ -22,16 +22,16 @@ def test_two_processes_that_share_domains_out_answer_as_one_that_has_all(catalog
     atlas, evaluator = Atlas(maps), FeatureL2("none")
     view = ReadyEncoding(np.random.default_rng(3).normal(size=DIM))
 
-    def part(some: list[str]) -> object:
-        there, left_out = atlas.gather(some, is_all=False)
-        asked = atlas.ask(there, evaluator, view, 3, 5)
-        return type(asked)(asked.log_evidences, asked.likeliest, left_out)
+    def part(part_names: list[str]) -> object:
+        mapped_domains, left_out = atlas.gather(part_names, is_all=False)
+        answer = atlas.ask(mapped_domains, evaluator, view, 3, 5)
+        return type(answer)(answer.log_evidences, answer.likeliest, left_out)
 
-    whole = whereabouts([part([*names, "unmapped"])], 3)
+    single = whereabouts([part([*names, "unmapped"])], 3)
     shared = whereabouts([part(names[:2]), part(["unmapped", *names[2:]])], 3)
-    assert list(whole.probabilities) == list(shared.probabilities)
-    assert np.allclose(list(whole.probabilities.values()), list(shared.probabilities.values()), atol=1e-6)
-    assert (whole.n_others, list(whole.left_out)) == (shared.n_others, list(shared.left_out)) == (4, ["unmapped"])
-    assert abs(whole.elsewhere_probability - shared.elsewhere_probability) < 1e-6
-    for name, localization in whole.likeliest.items():
+    assert list(single.probabilities) == list(shared.probabilities)
+    assert np.allclose(list(single.probabilities.values()), list(shared.probabilities.values()), atol=1e-6)
+    assert (single.n_others, list(single.left_out)) == (shared.n_others, list(shared.left_out)) == (4, ["unmapped"])
+    assert abs(single.elsewhere_probability - shared.elsewhere_probability) < 1e-6
+    for name, localization in single.likeliest.items():
         assert localization.belief.mode_m == shared.likeliest[name].belief.mode_m

