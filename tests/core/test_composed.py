@@ -52,12 +52,17 @@ def test_barred_landmarks_are_listed_last():
 
 
 def views_of(map_, encoding):
-    """The same view as it may be sent."""
-    whole = Query(np.arange(1.0, map_.n_landmarks + 1, dtype=np.float32), encoding=encoding)
-    apart = (2 - 2 * products_with_landmarks(map_, whole)).astype(np.float32)
-    ranks = rank_landmarks(apart)
-    nearest = ranks_from_ranked_landmarks(np.argsort(apart)[:15].tolist(), map_.n_landmarks)
-    return {"encoding": whole, "dissimilarities": Query(ranks, apart), "ranks": Query(ranks), "nearest": Query(nearest)}
+    """The same view in every form in which it may be sent."""
+    full_query = Query(np.arange(1.0, map_.n_landmarks + 1, dtype=np.float32), encoding=encoding)
+    dissimilarities = (2 - 2 * products_with_landmarks(map_, full_query)).astype(np.float32)
+    ranks = rank_landmarks(dissimilarities)
+    nearest = ranks_from_ranked_landmarks(np.argsort(dissimilarities)[:15].tolist(), map_.n_landmarks)
+    return {
+        "encoding": full_query,
+        "dissimilarities": Query(ranks, dissimilarities),
+        "ranks": Query(ranks),
+        "nearest": Query(nearest),
+    }
 
 
 def test_every_kind_of_view_finds_its_place(seasons):
@@ -97,16 +102,16 @@ def test_an_encoding_of_another_length_is_refused(seasons):
 def test_long_encodings_are_projected_and_keep_their_neighbours():
     rng = np.random.default_rng(6)
     place = rng.normal(size=(200, 20)) @ rng.normal(size=(20, 500))
-    one, other = (place + rng.normal(size=place.shape) for _ in range(2))
+    first, second = (place + rng.normal(size=place.shape) for _ in range(2))
     assert principal_directions(rng.normal(size=(50, 96)).astype(np.float32)) is None
-    map_ = compose_map(PLAN, drive_of(one), None, None, 100).map
+    map_ = compose_map(PLAN, drive_of(first), None, None, 100).map
     assert map_.landmark_model["projection"].shape == (500, 96)
     hits = [
         int(relevances(map_, Query(np.arange(1.0, 101, dtype=np.float32), encoding=row)).argmax()) == place
-        for place, row in enumerate(other.astype(np.float32))
+        for place, row in enumerate(second.astype(np.float32))
     ]
     assert np.mean(hits) > 0.9
-    short = compose_map(PLAN, drive_of(one[:9]), None, None, 5).map
+    short = compose_map(PLAN, drive_of(first[:9]), None, None, 5).map
     assert short.landmark_model["projection"].shape == (500, 8)
 
 
@@ -114,28 +119,30 @@ def test_numbers_that_hardly_differ_count_little():
     """Where they counted as much as those that show places, their noise would drown them."""
     rng = np.random.default_rng(3)
     places = rng.normal(size=(120, 24))
-    one, two = (np.hstack([places, 0.1 * rng.normal(size=(120, 1500))]).astype(np.float32) for _ in range(2))
-    projection = principal_directions(one)
-    u, v = (composed.described(drive, Moments.of(drive), projection) for drive in (one, two))
+    first, second = (np.hstack([places, 0.1 * rng.normal(size=(120, 1500))]).astype(np.float32) for _ in range(2))
+    projection = principal_directions(first)
+    u, v = (composed.described(drive, Moments.of(drive), projection) for drive in (first, second))
     assert np.mean((u @ v.T).argmax(axis=0) == np.arange(120)) > 0.95
-    flat = [unit((drive - drive.mean(axis=0)) / drive.std(axis=0)) for drive in (one, two)]
+    flat = [unit((drive - drive.mean(axis=0)) / drive.std(axis=0)) for drive in (first, second)]
     assert np.mean((flat[0] @ flat[1].T).argmax(axis=0) == np.arange(120)) < 0.5
 
 
 def test_two_seasons_teach_and_one_does_not(seasons):
-    one = compose_map(PLAN, drive_of(seasons[1]), None, None, 60)
-    two = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), None, 60)
-    assert one.map.likelihood_scale is None
-    assert two.map.likelihood_scale[0] > 2
-    assert two.second is not None
-    assert not np.array_equal(two.map.lists, two.rehearsal.lists), "the rehearsal does not know the second season"
+    of_one_season = compose_map(PLAN, drive_of(seasons[1]), None, None, 60)
+    of_two_seasons = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), None, 60)
+    assert of_one_season.map.likelihood_scale is None
+    assert of_two_seasons.map.likelihood_scale[0] > 2
+    assert of_two_seasons.second is not None
+    assert not np.array_equal(of_two_seasons.map.lists, of_two_seasons.rehearsal.lists), (
+        "the rehearsal does not know the second season"
+    )
     mean = np.mean([season.astype(np.float32).mean(axis=0) for season in seasons[:2]], axis=0)
-    np.testing.assert_allclose(two.map.usual_encoding[0], mean, atol=1e-4)
-    for built in (one, two):
-        assert built.map.novelty[0] == 1
-        assert (np.diff(built.map.novelty) <= 0).all()
-        assert np.isfinite(built.map.view_bits).all()
-        built.map.check()
+    np.testing.assert_allclose(of_two_seasons.map.usual_encoding[0], mean, atol=1e-4)
+    for outcome in (of_one_season, of_two_seasons):
+        assert outcome.map.novelty[0] == 1
+        assert (np.diff(outcome.map.novelty) <= 0).all()
+        assert np.isfinite(outcome.map.view_bits).all()
+        outcome.map.check()
 
 
 def test_places_that_look_alike_tell_less(seasons):
@@ -148,63 +155,62 @@ def test_places_that_look_alike_tell_less(seasons):
 
 def test_a_places_own_landmark_is_barred_from_the_rehearsal(seasons):
     second = drive_of(seasons[0])
-    built = compose_map(PLAN, drive_of(seasons[1]), second, second, 160)
-    own = [(built.rehearsal.lists[:, image] == chosen).any() for chosen, image in enumerate(_frames_of(built, second))]
-    assert not any(own)
-    listed = [(built.map.lists[:, image] == chosen).any() for chosen, image in enumerate(_frames_of(built, second))]
-    assert np.mean(listed) > 0.5
+    outcome = compose_map(PLAN, drive_of(seasons[1]), second, second, 160)
+    frames, landmarks = _frames_of(outcome, second), np.arange(160)
+    assert not (outcome.rehearsal.lists[:, frames] == landmarks).any()
+    assert (outcome.map.lists[:, frames] == landmarks).any(axis=0).mean() > 0.5
 
 
 @pytest.mark.parametrize("landmarks", ["of the second drive", "of its own"])
 def test_own_places_landmarks_can_be_barred_from_all_lists(seasons, landmarks):
     second = drive_of(seasons[0])
-    chosen_from = second if landmarks == "of the second drive" else None
+    candidates = second if landmarks == "of the second drive" else None
     plan = replace(PLAN, bars_own_place=True)
-    built = compose_map(plan, own := drive_of(seasons[1]), second, chosen_from, 120)
-    frames = _frames_of(built, own if chosen_from is None else second)
-    for lists in (built.map.lists, built.rehearsal.lists):
+    outcome = compose_map(plan, training := drive_of(seasons[1]), second, candidates, 120)
+    frames = _frames_of(outcome, training if candidates is None else second)
+    for lists in (outcome.map.lists, outcome.rehearsal.lists):
         assert (np.abs(frames[lists] - np.arange(160)) > 2).all()
-    usual = compose_map(PLAN, own, second, chosen_from, 120)
-    assert (np.abs(frames[usual.map.lists] - np.arange(160)) <= 2).any()
+    unbarred_outcome = compose_map(PLAN, training, second, candidates, 120)
+    assert (np.abs(frames[unbarred_outcome.map.lists] - np.arange(160)) <= 2).any()
 
 
-def _frames_of(built, second):
-    """Which frame each landmark was chosen as, which it still is in the rehearsal."""
-    model = built.rehearsal.landmark_model
+def _frames_of(outcome, second):
+    """[r] the frame of the second drive that each landmark was chosen as; in the rehearsal it still is."""
+    model = outcome.rehearsal.landmark_model
     u = unit(composed.described(second.encodings, Moments.of(second.encodings), None) @ model["projection"])
     return (model["prototypes"] @ u.T).argmax(axis=1)
 
 
 def test_landmarks_move_to_where_their_sums_come_nearer_to_places(seasons):
-    own, r = drive_of(seasons[1]), 40
-    built = compose_map(PLAN, own, None, None, r)
-    u = composed.described(own.encodings, Moments.of(own.encodings), None)
-    frames, learnt = u[farthest_first(u, r)], built.map.landmark_model["prototypes"]
+    drive, r = drive_of(seasons[1]), 40
+    outcome = compose_map(PLAN, drive, None, None, r)
+    u = composed.described(drive.encodings, Moments.of(drive.encodings), None)
+    frames, learnt = u[farthest_first(u, r)], outcome.map.landmark_model["prototypes"]
 
     def nearness(lists, landmarks):
         sums = sum(weight * landmarks[ids] for weight, ids in zip(WEIGHTS, lists, strict=True))
-        return (unit(sums) * built.places).sum(axis=1).mean()
+        return (unit(sums) * outcome.places).sum(axis=1).mean()
 
-    assert nearness(built.map.lists, learnt) > nearness(compose(u, frames, 4), frames) + 0.05
+    assert nearness(outcome.map.lists, learnt) > nearness(compose(u, frames, 4), frames) + 0.05
     np.testing.assert_allclose(np.linalg.norm(learnt, axis=1), 1, atol=1e-5)
 
 
 def test_landmarks_that_stay_are_compared_with_what_is_usual_now(seasons):
-    before = compose_map(PLAN, drive_of(seasons[0]), None, None, 60).map
-    after = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), before.landmark_model, 60).map
-    assert np.array_equal(after.landmark_model["prototypes"], before.landmark_model["prototypes"])
-    assert np.array_equal(after.landmark_model["usual"], after.usual_encoding)
-    assert not np.array_equal(after.usual_encoding, before.usual_encoding)
+    old_map = compose_map(PLAN, drive_of(seasons[0]), None, None, 60).map
+    new_map = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), old_map.landmark_model, 60).map
+    assert np.array_equal(new_map.landmark_model["prototypes"], old_map.landmark_model["prototypes"])
+    assert np.array_equal(new_map.landmark_model["usual"], new_map.usual_encoding)
+    assert not np.array_equal(new_map.usual_encoding, old_map.usual_encoding)
 
 
-@pytest.mark.parametrize("what", ["constant", "alike", "few"])
-def test_degenerate_drives(what, seasons):
+@pytest.mark.parametrize("defect", ["constant", "alike", "few"])
+def test_degenerate_drives(defect, seasons):
     encodings = seasons[1].copy()
-    if what == "constant":
+    if defect == "constant":
         encodings[:, 3] = 1.5
-    if what == "alike":
+    if defect == "alike":
         encodings[:] = encodings[0]
-    if what == "few":
+    if defect == "few":
         with pytest.raises(TooFewCandidatesError):
             compose_map(PLAN, drive_of(encodings[:9]), None, None, 10)
         with pytest.raises(InvalidMapConfigError, match="list_length"):
@@ -218,26 +224,26 @@ def test_degenerate_drives(what, seasons):
 
 
 def test_appended_frames_are_described_by_their_own_season(seasons):
-    before = compose_map(PLAN, drive_of(seasons[1][:100]), None, None, 60).map
-    model = before.landmark_model
-    added = drive_of(seasons[0][100:], np.arange(100.0, 160.0))
-    u = composed.described(added.encodings, before.live_statistics.encodings, model.get("projection"))
-    longer = append_drive(before, replace(added, dissimilarities=np.clip(2 - 2 * u @ model["prototypes"].T, 0, 4)))
-    assert np.array_equal(longer.lists[:, :100], before.lists)
-    hits, live = 0, longer.live_statistics
+    map_ = compose_map(PLAN, drive_of(seasons[1][:100]), None, None, 60).map
+    model = map_.landmark_model
+    drive = drive_of(seasons[0][100:], np.arange(100.0, 160.0))
+    u = composed.described(drive.encodings, map_.live_statistics.encodings, model.get("projection"))
+    longer_map = append_drive(map_, replace(drive, dissimilarities=np.clip(2 - 2 * u @ model["prototypes"].T, 0, 4)))
+    assert np.array_equal(longer_map.lists[:, :100], map_.lists)
+    hits, live = 0, longer_map.live_statistics
     for place in range(100, 160):
         query = Query(np.arange(1.0, 61, dtype=np.float32), encoding=seasons[2][place].astype(np.float32))
         live = live.observing(query)
-        hits += abs(int(relevances(longer, query, live).argmax()) - place) <= 1
+        hits += abs(int(relevances(longer_map, query, live).argmax()) - place) <= 1
     assert hits > 40
 
 
 def test_a_few_appended_frames_that_are_alike_mute_nothing(seasons):
-    before = compose_map(PLAN, drive_of(seasons[1]), None, None, 60).map
-    u = composed.described(drive_of(seasons[1][:1]).encodings, before.live_statistics.encodings, None)
-    added = drive_of(seasons[1][:1], np.array([7.5]))
-    after = append_drive(before, replace(added, dissimilarities=np.clip(2 - 2 * u @ u.T, 0, 4).repeat(60, axis=1)))
-    assert after.usual_encoding == pytest.approx(before.usual_encoding, abs=0.05)
+    map_ = compose_map(PLAN, drive_of(seasons[1]), None, None, 60).map
+    u = composed.described(drive_of(seasons[1][:1]).encodings, map_.live_statistics.encodings, None)
+    drive = drive_of(seasons[1][:1], np.array([7.5]))
+    longer_map = append_drive(map_, replace(drive, dissimilarities=np.clip(2 - 2 * u @ u.T, 0, 4).repeat(60, axis=1)))
+    assert longer_map.usual_encoding == pytest.approx(map_.usual_encoding, abs=0.05)
 
 
 def test_progress_is_told_in_small_steps_while_the_directions_are_found():

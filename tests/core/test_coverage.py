@@ -13,20 +13,20 @@ from deepsimbad.core.relevance import Relevance
 N, D = 120, 32
 
 
-def mapped(rng, first, stop):
+def map_of_places(rng, first, stop):
     """Places [n, d] that all look different, but for those of one stretch; and the map of them."""
     places = rng.normal(size=(N, D))
     places[first:stop] = places[first]
-    drive = Drive(position_m=2.0 * np.arange(N), encodings=seen(rng, places))
-    built = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0,)), drive, None, None, 60)
-    return places, built.map, built.map_drive
+    drive = Drive(position_m=2.0 * np.arange(N), encodings=views_of(rng, places))
+    outcome = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0,)), drive, None, None, 60)
+    return places, outcome.map, outcome.map_drive
 
 
-def seen(rng, places):
+def views_of(rng, places):
     return (places + 0.3 * rng.normal(size=places.shape)).astype(np.float32)
 
 
-def measured(map_, encodings):
+def dissimilarities_to(map_, encodings):
     """Squared distances [n, r] of unit encodings to the landmarks, by the season's own statistics."""
     z = (encodings - encodings.mean(axis=0)) / encodings.std(axis=0)
     z /= np.linalg.norm(z, axis=1, keepdims=True)
@@ -35,10 +35,10 @@ def measured(map_, encodings):
 
 def test_places_that_look_alike_are_recognised_less_often():
     rng = np.random.default_rng(0)
-    places, map_, own = mapped(rng, 40, 80)
-    season = SecondSeason(measured(map_, seen(rng, places)), np.stack(2 * [np.arange(N)], 1))
+    places, map_, drive = map_of_places(rng, 40, 80)
+    season = SecondSeason(dissimilarities_to(map_, views_of(rng, places)), np.stack(2 * [np.arange(N)], 1))
     for second in (None, season):
-        chance = placed_rightly(map_, own_views(map_, own.dissimilarities), second)
+        chance = placed_rightly(map_, own_views(map_, drive.dissimilarities), second)
         assert chance.shape == (N,)
         assert chance[45:75].max() < chance[:35].min()
         (stretch,) = worst_stretches(map_.position_m, chance)
@@ -46,12 +46,12 @@ def test_places_that_look_alike_are_recognised_less_often():
         assert 75 <= stretch.last <= 85
         assert chance[stretch.worst] == chance[stretch.first : stretch.last + 1].min()
         assert np.isclose(stretch.chance, chance[stretch.first : stretch.last + 1].mean())
-    assert np.array_equal(map_.coverage, placed_rightly(map_, own_views(map_, own.dissimilarities), None)), (
+    assert np.array_equal(map_.coverage, placed_rightly(map_, own_views(map_, drive.dissimilarities), None)), (
         "the map knows it"
     )
 
 
-@pytest.mark.parametrize("relevance", [each for each in Relevance if each is not Relevance.COMPOSED])
+@pytest.mark.parametrize("relevance", sorted(set(Relevance) - {Relevance.COMPOSED}))
 @pytest.mark.parametrize("knows_a_season", [False, True])
 def test_every_relevance_tells_where_it_can_be_trusted(relevance, knows_a_season):
     rng = np.random.default_rng(2)
@@ -60,29 +60,29 @@ def test_every_relevance_tells_where_it_can_be_trusted(relevance, knows_a_season
     model = {"prototypes": rng.normal(size=(60, D)).astype(np.float32)}
 
     def drive():
-        return Drive(position_m=2.0 * np.arange(N), encodings=seen(rng, places))
+        return Drive(position_m=2.0 * np.arange(N), encodings=views_of(rng, places))
 
-    def measure(some, landmarks):
-        apart = np.linalg.norm(some.encodings[:, np.newaxis] - landmarks["prototypes"], axis=2)
-        return replace(some, dissimilarities=apart.astype(np.float32))
+    def measure(unmeasured_drive, landmarks):
+        distances = np.linalg.norm(unmeasured_drive.encodings[:, np.newaxis] - landmarks["prototypes"], axis=2)
+        return replace(unmeasured_drive, dissimilarities=distances.astype(np.float32))
 
     plan = MapPlan(relevance, 4, (1.0,), same_route=True)
-    built = build_from_dissimilarities(plan, drive(), drive() if knows_a_season else None, model, measure)
-    chance = built.map.coverage
+    outcome = build_from_dissimilarities(plan, drive(), drive() if knows_a_season else None, model, measure)
+    chance = outcome.map.coverage
     assert ((chance >= 0) & (chance <= 1)).all()
     assert chance[45:75].max() < 0.75 * chance[:35].mean()
-    (stretch, *_) = worst_stretches(built.map.position_m, chance)
+    (stretch, *_) = worst_stretches(outcome.map.position_m, chance)
     assert 40 <= stretch.worst < 80
 
 
 def test_a_season_that_is_alike_nowhere_lowers_every_chance():
     rng = np.random.default_rng(1)
-    _, map_, own = mapped(rng, 0, 1)
-    strange = SecondSeason(measured(map_, rng.normal(size=(N, D))), np.stack(2 * [np.arange(N)], 1))
-    alone, both = (
-        placed_rightly(map_, own_views(map_, own.dissimilarities), second).mean() for second in (None, strange)
+    _, map_, drive = map_of_places(rng, 0, 1)
+    strange_season = SecondSeason(dissimilarities_to(map_, rng.normal(size=(N, D))), np.stack(2 * [np.arange(N)], 1))
+    chance, chance_with_season = (
+        placed_rightly(map_, own_views(map_, drive.dissimilarities), second).mean() for second in (None, strange_season)
     )
-    assert both < 0.7 * alone
+    assert chance_with_season < 0.7 * chance
 
 
 def test_no_stretch_stands_out_of_an_even_route():

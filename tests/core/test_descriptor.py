@@ -18,8 +18,8 @@ from deepsimbad.core.descriptor import (
 @given(st.lists(st.integers(0, 6), min_size=1, max_size=30))
 def test_ranks_count_nearer_landmarks_and_earlier_ties(dissimilarities):
     expected = [
-        1 + sum(1 for j, other in enumerate(dissimilarities) if (other, j) < (own, i))
-        for i, own in enumerate(dissimilarities)
+        1 + sum(1 for j, other in enumerate(dissimilarities) if (other, j) < (dissimilarity, i))
+        for i, dissimilarity in enumerate(dissimilarities)
     ]
     assert rank_landmarks(dissimilarities).tolist() == expected
     assert rank_landmarks([dissimilarities] * 2).tolist() == [expected] * 2

@@ -18,20 +18,20 @@ R = 40
 
 
 def scenery(rng, n, slowness_m=8.0, dims=12):
-    """[n, dims] what is seen along a route, a metre a row: a drift that forgets itself over some metres."""
-    kept = np.exp(-1 / slowness_m)
-    seen = np.empty((n, dims))
-    seen[0] = rng.normal(size=dims)
+    """[n, dims] views along a route, one a metre: a random drift that forgets itself over `slowness_m`."""
+    memory = np.exp(-1 / slowness_m)
+    rows = np.empty((n, dims))
+    rows[0] = rng.normal(size=dims)
     for row in range(1, n):
-        seen[row] = kept * seen[row - 1] + np.sqrt(1 - kept**2) * rng.normal(size=dims)
-    return seen
+        rows[row] = memory * rows[row - 1] + np.sqrt(1 - memory**2) * rng.normal(size=dims)
+    return rows
 
 
 def dissimilarities(rng, *drives, noise=0.5):
-    """Of each drive to landmarks of the last one, with noise of their own."""
-    seen = [drive + noise * rng.normal(size=drive.shape) for drive in drives]
-    landmarks = seen[-1][rng.permutation(len(seen[-1]))[:R]]
-    return [((one[:, np.newaxis] - landmarks) ** 2).sum(axis=2).astype(np.float32) for one in seen]
+    """Dissimilarities [n, r] of every drive, with noise of its own, to landmarks of the last one."""
+    noisy_drives = [drive + noise * rng.normal(size=drive.shape) for drive in drives]
+    landmarks = noisy_drives[-1][rng.permutation(len(noisy_drives[-1]))[:R]]
+    return [((views[:, np.newaxis] - landmarks) ** 2).sum(axis=2).astype(np.float32) for views in noisy_drives]
 
 
 def diagonal(n):
@@ -39,10 +39,10 @@ def diagonal(n):
 
 
 def verdict(rng, first, second, places=None, position_m=None, noise=0.5):
-    own, other = dissimilarities(rng, first, second, noise=noise)
+    first_dissimilarities, second_dissimilarities = dissimilarities(rng, first, second, noise=noise)
     n = min(len(first), len(second))
     position_m = np.arange(len(first), dtype=float) if position_m is None else position_m
-    return judge(own, other, diagonal(n) if places is None else places, position_m)
+    return judge(first_dissimilarities, second_dissimilarities, diagonal(n) if places is None else places, position_m)
 
 
 @pytest.mark.parametrize("n", [60, 150])
@@ -56,23 +56,23 @@ def test_drives_of_one_route_are_told_from_those_of_two(n, slowness_m):
 
 
 def test_the_significance_is_what_it_says():
-    """Of unrelated drives a tenth reach one of 0.1, about."""
+    """About a tenth of unrelated drives reach a significance of 0.1."""
     rng = np.random.default_rng(5)
-    found = [verdict(rng, scenery(rng, 80), scenery(rng, 80)).significance for _ in range(300)]
-    assert 0.05 < np.mean(np.array(found) <= 0.1) < 0.17
+    significances = [verdict(rng, scenery(rng, 80), scenery(rng, 80)).significance for _ in range(300)]
+    assert 0.05 < np.mean(np.array(significances) <= 0.1) < 0.17
 
 
 def test_a_verdict_tells_its_reasons():
     rng = np.random.default_rng(1)
     place = scenery(rng, 120)
-    same, other = verdict(rng, place, place), verdict(rng, place, scenery(rng, 120))
-    assert (same.accepted, same.why, same.n_pairs) == (True, None, 120)
-    assert same.significance <= SIGNIFICANCE < other.significance
-    assert same.statistic > 3 > other.statistic
-    assert same.correlation > 0.5 > 0.2 > other.correlation
-    assert (other.accepted, other.n_pairs) == (False, 120)
-    assert "agree no better than where one is shifted" in other.why
-    assert set(other.as_dict()) == {"accepted", "why", "n_pairs", "correlation", "statistic", "significance"}
+    accepted, refused = verdict(rng, place, place), verdict(rng, place, scenery(rng, 120))
+    assert (accepted.accepted, accepted.why, accepted.n_pairs) == (True, None, 120)
+    assert accepted.significance <= SIGNIFICANCE < refused.significance
+    assert accepted.statistic > 3 > refused.statistic
+    assert accepted.correlation > 0.5 > 0.2 > refused.correlation
+    assert (refused.accepted, refused.n_pairs) == (False, 120)
+    assert "agree no better than where one is shifted" in refused.why
+    assert set(refused.as_dict()) == {"accepted", "why", "n_pairs", "correlation", "statistic", "significance"}
 
 
 def trends(rng):
@@ -84,8 +84,8 @@ def trends(rng):
 def tunnels(rng):
     """A few places at the same position of two routes are unlike all others, and do not decide."""
     pair = scenery(rng, 120, 2.0), scenery(rng, 120, 2.0)
-    for seen in pair:
-        seen[50:55] = 20.0
+    for rows in pair:
+        rows[50:55] = 20.0
     return pair
 
 
@@ -109,8 +109,8 @@ def test_a_metre_of_error_in_positions_is_borne():
     rng = np.random.default_rng(7)
     for _ in range(10):
         place = scenery(rng, 150)
-        moved = np.maximum.accumulate(np.arange(150) + rng.normal(0, 1, 150))
-        pairs = same_places(Route(moved), Route(np.arange(150.0)))
+        position_m = np.maximum.accumulate(np.arange(150) + rng.normal(0, 1, 150))
+        pairs = same_places(Route(position_m), Route(np.arange(150.0)))
         assert verdict(rng, place, place, pairs).accepted
 
 
@@ -148,8 +148,8 @@ def test_frames_of_one_stop_are_one_place():
 def test_thirty_places_are_the_least(n, accepted):
     rng = np.random.default_rng(11)
     place = rng.normal(size=(90, 12))
-    found = verdict(rng, place, place, diagonal(n), noise=0.1)
-    assert (found.accepted, found.n_pairs) == (accepted, n)
+    judgement = verdict(rng, place, place, diagonal(n), noise=0.1)
+    assert (judgement.accepted, judgement.n_pairs) == (accepted, n)
 
 
 def test_recordings_of_one_day_are_no_two_seasons():
@@ -166,31 +166,31 @@ def test_recordings_of_one_day_are_no_two_seasons():
 def test_what_agrees_a_little_is_not_worth_learning_from():
     """Scenery that repeats agrees beyond chance on a long route; its landmarks would be trusted for nothing."""
     rng = np.random.default_rng(18)
-    found = verdict(rng, *[rng.normal(size=(500, 12))] * 2, noise=2.5)
-    assert (found.accepted, found.significance < SIGNIFICANCE) == (False, True)
-    assert 0 < found.correlation < LEAST_CORRELATION
-    assert "agree too little to learn from" in found.why
+    judgement = verdict(rng, *[rng.normal(size=(500, 12))] * 2, noise=2.5)
+    assert (judgement.accepted, judgement.significance < SIGNIFICANCE) == (False, True)
+    assert 0 < judgement.correlation < LEAST_CORRELATION
+    assert "agree too little to learn from" in judgement.why
 
 
 @pytest.mark.filterwarnings("error")
 def test_what_never_changes_tells_nothing():
-    same = np.tile(np.arange(R, dtype=np.float32), (100, 1))
-    moving = np.random.default_rng(12).normal(size=(100, R)).astype(np.float32)
-    for own, other in ((same, same), (same, moving), (moving, same)):
-        found = judge(own, other, diagonal(100), np.arange(100.0))
-        assert (found.accepted, found.statistic, found.significance) == (False, 0.0, 0.5)
-    one = judge(moving[:, :1], moving[:, :1], diagonal(100), np.arange(100.0))
-    assert (one.accepted, one.statistic) == (False, 0.0), "one landmark is always the nearest"
+    constant = np.tile(np.arange(R, dtype=np.float32), (100, 1))
+    varying = np.random.default_rng(12).normal(size=(100, R)).astype(np.float32)
+    for map_rows, drive_rows in ((constant, constant), (constant, varying), (varying, constant)):
+        judgement = judge(map_rows, drive_rows, diagonal(100), np.arange(100.0))
+        assert (judgement.accepted, judgement.statistic, judgement.significance) == (False, 0.0, 0.5)
+    of_one_landmark = judge(varying[:, :1], varying[:, :1], diagonal(100), np.arange(100.0))
+    assert (of_one_landmark.accepted, of_one_landmark.statistic) == (False, 0.0), "one landmark is always the nearest"
 
 
 def test_columns_that_never_change_do_no_harm():
     rng = np.random.default_rng(13)
     place = scenery(rng, 100)
-    own, other = dissimilarities(rng, place, place)
-    own[:, :5], other[:, 3:9] = 1e3, -1.0
-    found = judge(own, other, diagonal(100), np.arange(100.0))
-    assert found.accepted
-    assert np.isfinite([found.statistic, found.significance]).all()
+    map_rows, drive_rows = dissimilarities(rng, place, place)
+    map_rows[:, :5], drive_rows[:, 3:9] = 1e3, -1.0
+    judgement = judge(map_rows, drive_rows, diagonal(100), np.arange(100.0))
+    assert judgement.accepted
+    assert np.isfinite([judgement.statistic, judgement.significance]).all()
 
 
 def test_a_dense_recording_is_cut_into_places():
@@ -208,11 +208,11 @@ def test_a_dense_recording_is_cut_into_places():
 
 def test_a_long_route_is_judged_always_alike():
     rng = np.random.default_rng(15)
-    own = rng.random((6_000, 100), np.float32)
-    other = (own + 0.1 * rng.random(own.shape, np.float32)).astype(np.float32)
-    found = judge(own, other, diagonal(6_000), np.arange(6_000.0))
-    assert found.accepted
-    assert found == judge(own, other, diagonal(6_000), np.arange(6_000.0))
+    map_rows = rng.random((6_000, 100), np.float32)
+    drive_rows = (map_rows + 0.1 * rng.random(map_rows.shape, np.float32)).astype(np.float32)
+    judgement = judge(map_rows, drive_rows, diagonal(6_000), np.arange(6_000.0))
+    assert judgement.accepted
+    assert judgement == judge(map_rows, drive_rows, diagonal(6_000), np.arange(6_000.0))
 
 
 def test_pictures_of_nothing_and_of_a_camera_that_hung_are_told_by_name() -> None:
@@ -221,8 +221,8 @@ def test_pictures_of_nothing_and_of_a_camera_that_hung_are_told_by_name() -> Non
     encodings[4:9] = encodings[3]  # it hung for five pictures, and stood for the last of them
     encodings[10:] = encodings[10]  # the lens was covered
     position_m = np.array([0.0, 1, 2, 3, 4, 5, 6, 7, 7, 8, 9, 10])
-    nothing = np.arange(12) >= 10
-    drive = Drive(position_m=position_m, encodings=encodings, frame_name=names, shows_nothing=nothing)
+    shows_nothing = np.arange(12) >= 10
+    drive = Drive(position_m=position_m, encodings=encodings, frame_name=names, shows_nothing=shows_nothing)
     assert drive.picture_warnings("of the map") == [
         "2 of 12 pictures of the map show nothing: one grey, noise or the dark (10.png, 11.png)",
         "4 of 12 pictures of the map are the very same as the one before, and the robot had moved on: "

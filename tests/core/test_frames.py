@@ -6,7 +6,7 @@ NCLT = Camera(1232, 1616, "Cam5")
 
 
 @pytest.mark.parametrize(
-    ("camera", "others", "says"),
+    ("camera", "cameras", "says"),
     [
         (Camera(616, 808), [NCLT], None),
         (Camera(616, 800), [NCLT], None),
@@ -20,14 +20,14 @@ NCLT = Camera(1232, 1616, "Cam5")
         (Camera(100, 100), [Camera(4, 3)], "another shape"),
     ],
 )
-def test_pictures_that_are_compared_badly_are_told(camera: Camera, others: list[Camera], says: str | None) -> None:
-    why = camera.unlike(others, "the map's")
-    assert (why is None) == (says is None)
-    assert says is None or says in str(why)
+def test_pictures_that_are_compared_badly_are_told(camera: Camera, cameras: list[Camera], says: str | None) -> None:
+    reason = camera.unlike(cameras, "the map's")
+    assert (reason is None) == (says is None)
+    assert says is None or says in str(reason)
 
 
 @pytest.mark.parametrize(
-    ("camera", "others", "degrees"),
+    ("camera", "cameras", "degrees"),
     [
         (Camera(1616, 1232), [NCLT], 90),
         (Camera(404, 308, "Cam5"), [Camera(640, 480), NCLT], 0),  # of a map of both shapes nobody can tell
@@ -39,8 +39,8 @@ def test_pictures_that_are_compared_badly_are_told(camera: Camera, others: list[
         (NCLT, [Camera(1616, 1232)], 0),
     ],
 )
-def test_only_nclts_files_tell_which_way_they_lie(camera: Camera, others: list[Camera], degrees: int) -> None:
-    assert camera.turn_to(others) == degrees
+def test_only_nclts_files_tell_which_way_they_lie(camera: Camera, cameras: list[Camera], degrees: int) -> None:
+    assert camera.turn_to(cameras) == degrees
 
 
 def test_shape_and_document() -> None:

@@ -9,9 +9,9 @@ from deepsimbad.errors import CancelledError, InvalidEncodingError, InvalidMapCo
 
 
 def slow_selection(candidates, n_landmarks):
-    apart = ((candidates[:, None].astype(np.float64) - candidates[None]) ** 2).sum(-1)
-    np.fill_diagonal(apart, np.inf)
-    return np.argsort(-apart.min(axis=1), kind="stable")[:n_landmarks]
+    distances = ((candidates[:, None].astype(np.float64) - candidates[None]) ** 2).sum(-1)
+    np.fill_diagonal(distances, np.inf)
+    return np.argsort(-distances.min(axis=1), kind="stable")[:n_landmarks]
 
 
 @pytest.mark.parametrize("n_candidates", [2, 7, 8, 9, 100])
@@ -54,8 +54,8 @@ def test_progress_reaches_one_and_can_cancel(monkeypatch):
 
 def test_a_digest_tells_names_types_shapes_and_numbers_and_not_how_they_lie_in_memory():
     numbers = np.arange(6.0).reshape(2, 3)
-    others = (numbers.astype("f4"), numbers.reshape(3, 2), -numbers)
-    models = [{"a": numbers}, {"b": numbers}, *({"a": other} for other in others)]
+    variants = (numbers.astype("f4"), numbers.reshape(3, 2), -numbers)
+    models = [{"a": numbers}, {"b": numbers}, *({"a": other} for other in variants)]
     assert len({landmark_model_digest(model) for model in models}) == len(models)
     alike = [{"a": np.asfortranarray(numbers)}, {"a": numbers.astype(">f8")}]
     assert {landmark_model_digest(model) for model in alike} == {landmark_model_digest(models[0])}

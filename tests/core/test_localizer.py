@@ -67,10 +67,10 @@ def queries(seasons, snapshots):
 def walk(localizer, queries, frames, state=None):
     """The state after a view of every frame, moving exactly between them."""
     state = localizer.start() if state is None else state
-    before = frames[0]
+    last_frame = frames[0]
     for frame in frames:
-        state = localizer.step(state, queries[frame], float((frame - before) % N_IMAGES)).state
-        before = frame
+        state = localizer.step(state, queries[frame], float((frame - last_frame) % N_IMAGES)).state
+        last_frame = frame
     return state
 
 
@@ -94,13 +94,15 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
         query = queries[int(position_m) % N_IMAGES]
         step = localizer.step(state, query, action_m if number else 77.0)  # the first move is ignored
         live = live and live.observing(query, min(1.0, action_m) if number else 1.0)
-        answered = relevances(map_, query, live)
+        relevance_of_images = relevances(map_, query, live)
         shared = 0.0
         if number:
             belief = belief.predicted(action_m, math.sqrt(0.0025 + 0.01 * action_m) if action_m else 0.0, number)
             shared = map_.shared_error_after(action_m)
-        belief = belief.updated(ViewEvidence.of(answered, map_.update_rule, map_.log_likelihood_scale, shared), number)
-        np.testing.assert_allclose(step.state.relevance, answered)
+        belief = belief.updated(
+            ViewEvidence.of(relevance_of_images, map_.update_rule, map_.log_likelihood_scale, shared), number
+        )
+        np.testing.assert_allclose(step.state.relevance, relevance_of_images)
         np.testing.assert_allclose(step.state.belief.mass, belief.mass)
         assert step.state.belief.off_route == pytest.approx(belief.off_route)
         ahead = information_ahead(map_, 0.1)
@@ -126,10 +128,10 @@ def test_views_of_one_place_share_their_errors_and_those_far_apart_do_not(snapsh
 def test_while_it_stands_its_statistics_rest(snapshots, queries):
     localizer = ActiveLocalizer(snapshots(), LocalizerConfig())
     state = walk(localizer, queries, [10, 15])
-    stood = localizer.step(state, queries[15], 0.0).state
-    assert stood.live.encodings.weight == state.live.encodings.weight
-    moved = localizer.step(state, queries[20], 5.0).state
-    assert moved.live.encodings.weight > state.live.encodings.weight + 0.5
+    standing_state = localizer.step(state, queries[15], 0.0).state
+    assert standing_state.live.encodings.weight == state.live.encodings.weight
+    moving_state = localizer.step(state, queries[20], 5.0).state
+    assert moving_state.live.encodings.weight > state.live.encodings.weight + 0.5
 
 
 @pytest.mark.parametrize("relevance", list(Relevance))
@@ -137,27 +139,27 @@ def test_while_it_stands_its_statistics_rest(snapshots, queries):
 def test_every_relevance_and_filter_finds_the_way(snapshots, queries, relevance, kind):
     snapshot = snapshots(relevance)
     localizer = ActiveLocalizer(snapshot, LocalizerConfig(kind, n_particles=3000))
-    errors, before = [], []
+    errors, entropy_drops = [], []
     for start in range(0, 90, 15):
         state = walk(localizer, queries, [start])
-        before.append(entropy(state.belief.mass))
+        entropy_drops.append(entropy(state.belief.mass))
         state = walk(localizer, queries, list(range(start, start + 55, 5)), localizer.start())
         errors.append(abs(int(state.belief.mass.argmax()) - (start + 50)))
-        before[-1] -= entropy(state.belief.mass)
+        entropy_drops[-1] -= entropy(state.belief.mass)
         assert state.belief.mass.sum() == pytest.approx(1)
     assert np.median(errors) <= 1, errors
-    assert np.mean(before) > 0, "it is surer after ten moves"
+    assert np.mean(entropy_drops) > 0, "it is surer after ten moves"
 
 
 def test_a_chosen_update_and_planner_are_used(snapshots, queries):
     snapshot = snapshots(Relevance.RRF)
-    usual = ActiveLocalizer(snapshot, LocalizerConfig()).step
-    chosen = ActiveLocalizer(snapshot, LocalizerConfig(update=UpdateRule.LOG_LIKELIHOOD, planner="constant:2"))
-    start = chosen.start()
-    step = chosen.step(start, queries[5])
+    default_step = ActiveLocalizer(snapshot, LocalizerConfig()).step
+    localizer = ActiveLocalizer(snapshot, LocalizerConfig(update=UpdateRule.LOG_LIKELIHOOD, planner="constant:2"))
+    start = localizer.start()
+    step = localizer.step(start, queries[5])
     assert step.plan is not None
     assert (step.plan.planner, step.plan.action_m) == ("constant:2", 2.0)
-    assert not np.allclose(step.state.belief.mass, usual(start, queries[5]).state.belief.mass)
+    assert not np.allclose(step.state.belief.mass, default_step(start, queries[5]).state.belief.mass)
     with pytest.raises(InvalidInputError):
         ActiveLocalizer(snapshot, LocalizerConfig(planner="constant:3"))
 
@@ -169,12 +171,12 @@ def test_a_chosen_update_and_planner_are_used(snapshots, queries):
 def test_a_robot_that_was_carried_keeps_what_is_usual(snapshots, queries, kind):
     localizer = ActiveLocalizer(snapshots(), LocalizerConfig(kind))
     state = walk(localizer, queries, [10, 15, 20])
-    carried = localizer.with_prior(state, 100.0, 2.0)
-    assert abs(int(carried.belief.mass.argmax()) - 100) <= 2
-    assert carried.live is state.live
-    assert carried.n_observations == 3
-    after = localizer.step(carried, queries[105], 5.0).state
-    assert abs(int(after.belief.mass.argmax()) - 105) <= 4
+    carried_state = localizer.with_prior(state, 100.0, 2.0)
+    assert abs(int(carried_state.belief.mass.argmax()) - 100) <= 2
+    assert carried_state.live is state.live
+    assert carried_state.n_observations == 3
+    next_state = localizer.step(carried_state, queries[105], 5.0).state
+    assert abs(int(next_state.belief.mass.argmax()) - 105) <= 4
 
 
 # --- views that say nothing -----------------------------------------------------------------------------------
@@ -188,13 +190,15 @@ def test_a_view_that_shows_nothing_moves_no_belief(snapshots, queries, kind, rel
     first = localizer.step(localizer.start(), grey)
     np.testing.assert_allclose(first.state.belief.mass, localizer.start().belief.mass)
     state = walk(localizer, queries, [10, 15, 20], localizer.start(10.0, 0.5))
-    stood = localizer.step(state, grey, 0.0)
-    assert entropy(stood.state.belief.mass) >= entropy(state.belief.mass) - (1e-9 if kind is FilterKind.GRID else 0.1)
-    assert stood.state.belief.mass.argmax() == state.belief.mass.argmax()
-    assert stood.state.live is state.live
-    moved = localizer.step(state, grey, 5.0)
-    assert abs(int(moved.state.belief.mass.argmax()) - (int(state.belief.mass.argmax()) + 5)) <= 1
-    assert stood.state.n_observations == 4
+    standing_step = localizer.step(state, grey, 0.0)
+    assert entropy(standing_step.state.belief.mass) >= entropy(state.belief.mass) - (
+        1e-9 if kind is FilterKind.GRID else 0.1
+    )
+    assert standing_step.state.belief.mass.argmax() == state.belief.mass.argmax()
+    assert standing_step.state.live is state.live
+    moving_step = localizer.step(state, grey, 5.0)
+    assert abs(int(moving_step.state.belief.mass.argmax()) - (int(state.belief.mass.argmax()) + 5)) <= 1
+    assert standing_step.state.n_observations == 4
 
 
 def test_noise_tells_nothing_of_a_route_and_an_odd_season_does():
@@ -205,9 +209,11 @@ def test_noise_tells_nothing_of_a_route_and_an_odd_season_does():
     map_ = compose_map(MapPlan(Relevance.COMPOSED, LIST_LENGTH, ACTIONS_M), frames(place), None, None, N_LANDMARKS).map
     localizer = ActiveLocalizer(map_, LocalizerConfig())
     noise = np.abs(rng.normal(0, 4 * place.std(), 400))
-    seen = np.where(rng.random(400) < 0.1, rng.normal(0, 3, 400), 0) * place.std(axis=0)  # of a season
-    both = np.concatenate([np.tile(noise, (60, 1)) + rng.normal(0, 0.3, (60, 400)), place[:60] + seen])
-    views = [Query(np.arange(1.0, N_LANDMARKS + 1, dtype=np.float32), None, view) for view in both.astype(np.float32)]
+    season_shift = np.where(rng.random(400) < 0.1, rng.normal(0, 3, 400), 0) * place.std(axis=0)  # of a season
+    encodings = np.concatenate([np.tile(noise, (60, 1)) + rng.normal(0, 0.3, (60, 400)), place[:60] + season_shift])
+    views = [
+        Query(np.arange(1.0, N_LANDMARKS + 1, dtype=np.float32), None, view) for view in encodings.astype(np.float32)
+    ]
     state = localizer.start()
     for number, view in enumerate(views):
         step = localizer.step(state, view, 1.0)
@@ -216,8 +222,8 @@ def test_noise_tells_nothing_of_a_route_and_an_odd_season_does():
         if number < 60:
             assert entropy(state.belief.mass) > math.log2(N_IMAGES) - 1
     assert abs(int(state.belief.mass.argmax()) - 59) <= 1
-    whole = np.concatenate([place, both[:3]]).astype(np.float32)
-    assert np.flatnonzero(shows_nothing(lambda: [whole])).tolist() == [150, 151, 152]
+    drive = np.concatenate([place, encodings[:3]]).astype(np.float32)
+    assert np.flatnonzero(shows_nothing(lambda: [drive])).tolist() == [150, 151, 152]
 
 
 def test_a_season_that_is_stranger_than_any_known_is_soon_believed():
@@ -226,11 +232,11 @@ def test_a_season_that_is_stranger_than_any_known_is_soon_believed():
     map_ = compose_map(MapPlan(Relevance.COMPOSED, LIST_LENGTH, ACTIONS_M), frames(place), None, None, 60).map
     localizer = ActiveLocalizer(map_, LocalizerConfig())
     shift = np.where(np.arange(400) < 120, 3.0, 0.0)
-    told, state = [], localizer.start()
+    is_informative, state = [], localizer.start()
     for view in (place + shift + rng.normal(0, 0.2, place.shape)).astype(np.float32)[:80]:
         step = localizer.step(state, Query(np.arange(1.0, 61, dtype=np.float32), None, view), 1.0)
-        told.append(step.is_informative)
+        is_informative.append(step.is_informative)
         state = step.state
-    assert not any(told[:15])
-    assert all(told[30:])
+    assert not any(is_informative[:15])
+    assert all(is_informative[30:])
     assert abs(int(state.belief.mass.argmax()) - 79) <= 1

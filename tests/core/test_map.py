@@ -12,7 +12,7 @@ from deepsimbad.errors import InvalidMapConfigError, InvalidRouteError
 N, H, R = 8, 2, 5
 
 
-def whole(**changes):
+def full_map(**changes):
     """A map that has every array there is."""
     rng = np.random.default_rng(0)
     lengths = {"n": N, "h": H, "r": R, "a": 2, "*": 3}
@@ -47,14 +47,14 @@ def whole(**changes):
 )
 def test_parts_that_do_not_fit_are_refused(changes, says):
     with pytest.raises(InvalidMapConfigError, match=says):
-        whole(**changes)
+        full_map(**changes)
 
 
 def test_a_route_that_goes_backwards_and_an_unknown_relevance_are_refused():
     with pytest.raises(InvalidRouteError):
-        whole(position_m=np.arange(float(N))[::-1])
+        full_map(position_m=np.arange(float(N))[::-1])
     with pytest.raises(ValueError, match="telepathy"):
-        _ = whole(config={"relevance": "telepathy", "n_landmarks": R}).relevance
+        _ = full_map(config={"relevance": "telepathy", "n_landmarks": R}).relevance
 
 
 @pytest.mark.parametrize(
@@ -73,22 +73,22 @@ def test_a_route_that_goes_backwards_and_an_unknown_relevance_are_refused():
     ],
 )
 def test_what_makes_no_sense_may_not_serve(changes, says):
-    whole().check()
-    whole(x_m=np.full(N, np.nan)).check()
-    whole(actions_m=(-1.0, 0.0)).check()
+    full_map().check()
+    full_map(x_m=np.full(N, np.nan)).check()
+    full_map(actions_m=(-1.0, 0.0)).check()
     with pytest.raises(InvalidMapConfigError, match=says):
-        whole(**changes).check()
+        full_map(**changes).check()
 
 
 def test_nothing_in_it_can_be_written_to():
-    map_ = whole(landmark_model={"prototypes": np.zeros(3)})
+    map_ = full_map(landmark_model={"prototypes": np.zeros(3)})
     for array in (*map_.arrays().values(), *map_.landmark_model.values(), map_.actions_m):
         with pytest.raises(ValueError, match="read-only"):
             array[:1] = 0
 
 
 def test_it_comes_back_from_its_document_and_arrays():
-    map_ = whole(landmark_model={"prototypes": np.zeros(3)}, metrics={"anr": 1.5}, closed=True)
+    map_ = full_map(landmark_model={"prototypes": np.zeros(3)}, metrics={"anr": 1.5}, closed=True)
     again = Map.from_arrays(map_.document(), map_.landmark_model, map_.arrays(), 80)
     assert again.document() == map_.document()
     assert again.arrays().keys() == map_.arrays().keys() == ARRAYS.keys()
@@ -97,20 +97,20 @@ def test_it_comes_back_from_its_document_and_arrays():
 
 
 def test_a_part_of_its_images_and_those_put_together_again():
-    map_ = whole()
-    some, others = np.array([0, 1, 4, 6]), np.array([2, 3, 5, 7])
-    part = map_.at(some)
+    map_ = full_map()
+    images, other_images = np.array([0, 1, 4, 6]), np.array([2, 3, 5, 7])
+    part = map_.at(images)
     assert part.position_m.tolist() == [0, 1, 4, 6]
-    assert np.array_equal(part.lists, map_.lists[:, some])
-    assert np.array_equal(part.q_values, map_.q_values[some])
+    assert np.array_equal(part.lists, map_.lists[:, images])
+    assert np.array_equal(part.q_values, map_.q_values[images])
     assert part.statistics is map_.statistics
-    added = {name: array for name, array in map_.at(others).arrays().items() if "n" in ARRAYS[name].axes}
-    for name, array in part.with_images(added).arrays().items():
+    new_arrays = {name: array for name, array in map_.at(other_images).arrays().items() if "n" in ARRAYS[name].axes}
+    for name, array in part.with_images(new_arrays).arrays().items():
         assert np.array_equal(array, map_.arrays()[name]), name
 
 
 def test_of_added_images_what_only_the_others_know_is_unknown():
-    map_ = replace(whole(), x_m=None, y_m=None, frame_name=None, frame_drive=None)
+    map_ = replace(full_map(), x_m=None, y_m=None, frame_name=None, frame_drive=None)
     names = np.array([f"{i}.png" for i in range(N)])
     required = {name: map_.arrays()[name] for name, row in ARRAYS.items() if "n" in row.axes and row.unknown is None}
     longer = map_.with_images({**required, "x_m": np.arange(float(N)), "frame_name": names})

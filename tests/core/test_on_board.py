@@ -21,7 +21,7 @@ def slow_packed(ids, n_landmarks):
     width = 0
     while 2**width < n_landmarks:
         width += 1
-    digits = f"{len(ids):016b}" + "".join(f"{one:0{width}b}" if width else "" for one in ids)
+    digits = f"{len(ids):016b}" + "".join(f"{landmark:0{width}b}" if width else "" for landmark in ids)
     digits += "0" * (-len(digits) % 8)
     return bytes(int(digits[place : place + 8], 2) for place in range(0, len(digits), 8))
 

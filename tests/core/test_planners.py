@@ -24,8 +24,8 @@ def sharp(place):
     return 0.5 * np.eye(N_IMAGES)[place] + 0.5 / N_IMAGES
 
 
-def view_of(mass=None, bits=None, closed=False, **more):
-    actions_m = more.get("actions_m", ACTIONS_M)
+def view_of(mass=None, bits=None, closed=False, **options):
+    actions_m = options.get("actions_m", ACTIONS_M)
     n_images = N_IMAGES if bits is None else len(bits)
     map_ = Map(
         config={"relevance": "rrf", "n_landmarks": 1},
@@ -34,12 +34,12 @@ def view_of(mass=None, bits=None, closed=False, **more):
         closed=closed,
         actions_m=actions_m,
         view_bits=None if bits is None else bits.copy(),
-        novelty=more.get("novelty", np.r_[1.0, np.zeros(10)]),
-        q_values=more.get("q_values"),
+        novelty=options.get("novelty", np.r_[1.0, np.zeros(10)]),
+        q_values=options.get("q_values"),
     )
     mass = np.full(N_IMAGES, 1 / N_IMAGES) if mass is None else mass
     return PlanningView(
-        map_, mass, more.get("relevance"), more.get("seed", 0), more.get("step", 1), more.get("price", 0.0)
+        map_, mass, options.get("relevance"), options.get("seed", 0), options.get("step", 1), options.get("price", 0.0)
     )
 
 
@@ -63,8 +63,8 @@ def slow_values(bits, actions_m, news, price, closed):
             for a, metres in enumerate(actions_m):
                 to = int(x + metres) % n if closed else int(x + metres)
                 inside = 0 <= to < n
-                there, then = (bits[to], best[to]) if inside else (bits.mean(), best.mean())
-                values[x, a] = news[a] * there - price * abs(metres) + 0.9 * then
+                next_bits, next_best = (bits[to], best[to]) if inside else (bits.mean(), best.mean())
+                values[x, a] = news[a] * next_bits - price * abs(metres) + 0.9 * next_best
         best = values.max(axis=1)
     return values
 
@@ -178,8 +178,8 @@ def test_random_moves_are_drawn_alike_from_the_seed_and_the_step():
 
 @pytest.mark.parametrize("text", ["informed", "nnql", "random", "constant:10", "constant:2.5"])
 def test_planners_by_name(text):
-    ones = np.ones((N_IMAGES, 10), np.float32)
-    plan = parse_planner(text, (1.0, 2.5, 10.0))(view_of(q_values=ones, relevance=ones[:, 0]))
+    q_values = np.ones((N_IMAGES, 10), np.float32)
+    plan = parse_planner(text, (1.0, 2.5, 10.0))(view_of(q_values=q_values, relevance=q_values[:, 0]))
     assert plan.planner == text
     assert text[:9] != "constant:" or plan.action_m == float(text[9:])
 
@@ -196,6 +196,6 @@ def test_no_such_planner_is_named_with_those_there_are(text):
 
 @pytest.mark.parametrize("text", ["informed", "nnql", "random", "constant:1"])
 def test_a_domain_of_one_move_gets_that_move(text):
-    ones = np.ones(N_IMAGES, np.float32)
-    known = {"relevance": ones, "actions_m": ACTIONS_M[:1], "q_values": ones[:, np.newaxis]}
-    assert parse_planner(text, (1.0,))(view_of(sharp(4), ones, **known)).action_m == 1
+    relevance = np.ones(N_IMAGES, np.float32)
+    options = {"relevance": relevance, "actions_m": ACTIONS_M[:1], "q_values": relevance[:, np.newaxis]}
+    assert parse_planner(text, (1.0,))(view_of(sharp(4), relevance, **options)).action_m == 1

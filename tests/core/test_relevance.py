@@ -42,20 +42,20 @@ def test_the_fused_sum_equals_indexing_at_every_size(n_images):
 
 def test_a_landmark_that_never_moved_says_little(scene):
     constant = np.tile(scene["map"][0], (5, 1))
-    built = a_map(Relevance.STANDARDISED, constant, 3)
-    assert np.isfinite(relevances(built, Query(rank_landmarks(scene["query"][0])))).all()
+    map_ = a_map(Relevance.STANDARDISED, constant, 3)
+    assert np.isfinite(relevances(map_, Query(rank_landmarks(scene["query"][0])))).all()
 
 
 def test_what_a_relevance_needs_is_asked_for(scene):
     ranks = rank_landmarks(scene["query"][0])
     for name in (Relevance.SIMBAD, Relevance.BRUTE_FORCE):
-        built = a_map(name, scene["map"], 4, encodings=scene["map encodings"])
+        map_ = a_map(name, scene["map"], 4, encodings=scene["map encodings"])
         with pytest.raises(InvalidInputError):
-            relevances(built, Query(ranks))
+            relevances(map_, Query(ranks))
     with pytest.raises(InvalidInputError, match="numbers"):
-        relevances(built, Query(ranks, encoding=np.zeros(3, np.float32)))
+        relevances(map_, Query(ranks, encoding=np.zeros(3, np.float32)))
     with pytest.raises(InvalidMapConfigError, match="needs statistics"):
-        replace(built, config={**built.config, "relevance": "standardised"})
+        replace(map_, config={**map_.config, "relevance": "standardised"})
 
 
 @pytest.mark.parametrize(("list_length", "n_images"), [(0, 5), (N_LANDMARKS + 1, 5), (2, 0)])
@@ -74,14 +74,14 @@ def test_shortlist_is_the_stable_order(length):
 
 def test_live_statistics_start_as_the_maps_and_follow_the_views():
     rng = np.random.default_rng(0)
-    usual = LandmarkStatistics.of_map(rank_landmarks(rng.random((30, 6))))
-    again = LandmarkStatistics.from_mean_std(np.stack([usual.mean, usual.std]))
-    np.testing.assert_allclose(again.square, usual.square)
-    followed = usual
+    statistics = LandmarkStatistics.of_map(rank_landmarks(rng.random((30, 6))))
+    again = LandmarkStatistics.from_mean_std(np.stack([statistics.mean, statistics.std]))
+    np.testing.assert_allclose(again.square, statistics.square)
+    live = statistics
     view = rank_landmarks([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     for _ in range(5000):
-        followed = followed.observing(view)
-    np.testing.assert_allclose(followed.standardise(view), 0, atol=0.15)
+        live = live.observing(view)
+    np.testing.assert_allclose(live.standardise(view), 0, atol=0.15)
 
 
 @pytest.mark.parametrize("relevance", sorted(set(Relevance) - {Relevance.COMPOSED}))

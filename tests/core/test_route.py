@@ -24,11 +24,11 @@ def test_a_bin_of_the_histogram_holds_what_lies_in_it(n, closed):
     position_m, mass = np.sort(2.0 * n * rng.random(n)), rng.dirichlet(np.ones(n))
     position_m[3:6] = position_m[3:4]
     route = Route(position_m, closed)
-    edges_m, held = route.histogram_edges_m, route.histogram_of(mass)
-    assert (held > 0).all()
+    edges_m, bin_mass = route.histogram_edges_m, route.histogram_of(mass)
+    assert (bin_mass > 0).all()
     until_m = np.append((position_m[1:] + position_m[:-1]) / 2, edges_m[-1])
     from_m = np.append(edges_m[0], until_m[:-1])
-    for first_m, last_m, share in zip(edges_m, edges_m[1:], held, strict=False):
+    for first_m, last_m, share in zip(edges_m, edges_m[1:], bin_mass, strict=False):
         within_m = np.clip(np.minimum(last_m, until_m) - np.maximum(first_m, from_m), 0, None)
         length_m = np.maximum(until_m - from_m, 1e-12)
         points = (until_m == from_m) & (until_m > first_m) & (until_m <= last_m)
@@ -111,8 +111,8 @@ def wandering(rng, n, spread):
 def test_squares_find_what_looking_at_all_finds(seed, tolerance_m, spread):
     rng = np.random.default_rng(seed)
     query, map_route = wandering(rng, 20, spread), wandering(rng, 60, spread)
-    found = true_images_of(query, map_route, tolerance_m, max_heading_rad=np.pi)
-    assert [ids.tolist() for ids in found] == by_looking_at_all(query, map_route, tolerance_m)
+    true_images = true_images_of(query, map_route, tolerance_m, max_heading_rad=np.pi)
+    assert [ids.tolist() for ids in true_images] == by_looking_at_all(query, map_route, tolerance_m)
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([0.0, 0.1, 2.0, np.inf]))
@@ -136,8 +136,8 @@ def test_the_nearest_is_paired():
 
 def test_truth_along_the_route():
     route = Route(np.arange(6.0))
-    found = true_images_of(Route(np.array([0.0, 3.4, 9.0])), route, 2.0)
-    assert [ids.tolist() for ids in found] == [[0, 1, 2], [2, 3, 4, 5], []]
+    true_images = true_images_of(Route(np.array([0.0, 3.4, 9.0])), route, 2.0)
+    assert [ids.tolist() for ids in true_images] == [[0, 1, 2], [2, 3, 4, 5], []]
 
 
 def test_truth_in_the_plane_needs_the_same_direction():
@@ -146,17 +146,17 @@ def test_truth_in_the_plane_needs_the_same_direction():
     x = np.r_[up, up[::-1]]
     there_and_back = Route(np.arange(20.0), x_m=x, y_m=np.zeros(20))
     upward = Route(np.arange(10.0), x_m=up, y_m=np.full(10, 0.5))
-    found = true_images_of(upward, there_and_back, 1.2)
-    assert found[4].tolist() == [3, 4, 5]
+    true_images = true_images_of(upward, there_and_back, 1.2)
+    assert true_images[4].tolist() == [3, 4, 5]
 
 
 def test_truth_in_the_plane_finds_both_visits_of_a_place():
     circle = np.linspace(0, 4 * np.pi, 200)
     twice_round = Route(np.arange(200.0), x_m=50 * np.cos(circle), y_m=50 * np.sin(circle))
-    found = true_images_of(twice_round, twice_round, 2.0)
-    assert {100, 0} <= set(found[100].tolist()) | set(found[0].tolist())
-    assert all(abs(i - 50) < 3 or abs(i - 149.5) < 3 for i in found[50].tolist())
-    assert len(found[50]) >= 2
+    true_images = true_images_of(twice_round, twice_round, 2.0)
+    assert {100, 0} <= set(true_images[100].tolist()) | set(true_images[0].tolist())
+    assert all(abs(i - 50) < 3 or abs(i - 149.5) < 3 for i in true_images[50].tolist())
+    assert len(true_images[50]) >= 2
 
 
 def test_same_places_are_the_nearest_within_the_tolerance():

@@ -19,26 +19,26 @@ def statistics_of(n_landmarks, seed=3, loadings=None):
     return replace(LandmarkStatistics.from_mean_std(np.stack([mean, std])), loadings=loadings)
 
 
-def moments_beyond(mean, std, least):
+def moments_beyond(mean, std, bound):
     """Mean and variance of a normal variable beyond a bound, by a sum over its density."""
-    z = np.linspace(max(least, mean - 9 * std), mean + 9 * std, 200_001)
+    z = np.linspace(max(bound, mean - 9 * std), mean + 9 * std, 200_001)
     density = np.exp(-0.5 * ((z - mean) / std) ** 2)
-    first = (z * density).sum() / density.sum()
-    return first, (np.square(z - first) * density).sum() / density.sum()
+    mean_beyond = (z * density).sum() / density.sum()
+    return mean_beyond, (np.square(z - mean_beyond) * density).sum() / density.sum()
 
 
 @pytest.mark.parametrize("n_sent", [1, 3, 7])
 def test_a_landmark_by_itself_is_a_normal_variable_beyond_the_last_sent(n_sent):
-    statistics, sent = statistics_of(9), [4, 8, 1, 0, 6, 2, 3][:n_sent]
-    view = statistics.view(ranks_from_ranked_landmarks(sent, 9))
+    statistics, sent_ids = statistics_of(9), [4, 8, 1, 0, 6, 2, 3][:n_sent]
+    view = statistics.view(ranks_from_ranked_landmarks(sent_ids, 9))
     last = NORMAL.inv_cdf(n_sent / 9)  # between the scores of ranks m and m + 1
     for landmark in range(9):
-        if landmark in sent:
-            score = NORMAL.inv_cdf((sent.index(landmark) + 0.5) / 9)
+        if landmark in sent_ids:
+            score = NORMAL.inv_cdf((sent_ids.index(landmark) + 0.5) / 9)
             z, variance = (score - statistics.mean[landmark]) / statistics.std[landmark], 0.0
         else:
-            least = (last - statistics.mean[landmark]) / statistics.std[landmark]
-            z, variance = moments_beyond(0.0, 1.0, least)
+            bound = (last - statistics.mean[landmark]) / statistics.std[landmark]
+            z, variance = moments_beyond(0.0, 1.0, bound)
         assert view.z[landmark] == pytest.approx(z, abs=2e-4)
         assert view.certainty[landmark] == pytest.approx(1 - variance, abs=2e-4)
 
@@ -47,16 +47,16 @@ def test_landmarks_go_together_as_a_common_factor_says():
     """One factor: its most probable value is looked for on a fine grid, and its curvature taken there."""
     loadings = np.array([0.9, 0.8, -0.6, 0.3, 0.0], np.float32)[:, np.newaxis]
     statistics = statistics_of(5, loadings=loadings)
-    sent = [0, 3]
-    view = statistics.view(ranks_from_ranked_landmarks(sent, 5))
-    own = 1 - np.square(loadings[:, 0].astype(float))
+    sent_ids = [0, 3]
+    view = statistics.view(ranks_from_ranked_landmarks(sent_ids, 5))
+    own_variance = 1 - np.square(loadings[:, 0].astype(float))
     last = (NORMAL.inv_cdf(2 / 5) - statistics.mean) / statistics.std
 
     def log_probability(factor):
         total = -0.5 * factor**2
         for landmark in range(5):
-            expected, std = loadings[landmark, 0] * factor, math.sqrt(own[landmark])
-            if landmark in sent:
+            expected, std = loadings[landmark, 0] * factor, math.sqrt(own_variance[landmark])
+            if landmark in sent_ids:
                 total += -0.5 * ((view.z[landmark] - expected) / std) ** 2
             else:
                 total += math.log(0.5 * math.erfc((last[landmark] - expected) / std / math.sqrt(2)))
@@ -67,7 +67,7 @@ def test_landmarks_go_together_as_a_common_factor_says():
     step = 1e-3
     curvature = (log_probability(best + step) - 2 * log_probability(best) + log_probability(best - step)) / step**2
     for landmark in (1, 2, 4):
-        expected, std = loadings[landmark, 0] * best, math.sqrt(own[landmark])
+        expected, std = loadings[landmark, 0] * best, math.sqrt(own_variance[landmark])
         mean, variance = moments_beyond(expected, std, last[landmark])
         further, _ = moments_beyond(expected + step, std, last[landmark])
         follows = (further - mean) / step * loadings[landmark, 0]
@@ -86,15 +86,15 @@ def test_what_is_unusually_near_brings_its_likes_nearer():
 
 def test_all_ranks_are_known_or_none():
     statistics = statistics_of(7)
-    everything = ranks_from_ranked_landmarks([3, 1, 0, 6, 5, 2, 4], 7)
-    assert (statistics.view(everything).z == statistics.standardise(everything)).all()
-    assert (statistics.view(everything).certainty == 1).all()
+    all_ranks = ranks_from_ranked_landmarks([3, 1, 0, 6, 5, 2, 4], 7)
+    assert (statistics.view(all_ranks).z == statistics.standardise(all_ranks)).all()
+    assert (statistics.view(all_ranks).certainty == 1).all()
     but_the_last = statistics.view(ranks_from_ranked_landmarks([3, 1, 0, 6, 5, 2], 7))
-    assert (but_the_last.z == statistics.standardise(everything)).all()
-    nothing = Query.uninformative(7).ranks
-    assert (statistics.view(nothing).z == 0).all()
-    assert (statistics.view(nothing).certainty == 0).all()
-    unmoved = statistics.observing(nothing)
+    assert (but_the_last.z == statistics.standardise(all_ranks)).all()
+    no_ranks = Query.uninformative(7).ranks
+    assert (statistics.view(no_ranks).z == 0).all()
+    assert (statistics.view(no_ranks).certainty == 0).all()
+    unmoved = statistics.observing(no_ranks)
     assert unmoved.mean == pytest.approx(statistics.mean)
     assert unmoved.square == pytest.approx(statistics.square)
 
@@ -102,19 +102,19 @@ def test_all_ranks_are_known_or_none():
 def test_running_statistics_take_the_expected_moments():
     statistics = replace(statistics_of(9), weight=4.0)
     ranks = ranks_from_ranked_landmarks([5, 2, 7], 9)
-    view, after = statistics.view(ranks), statistics.observing(ranks)
+    view, live = statistics.view(ranks), statistics.observing(ranks)
     for landmark in range(9):
         score = statistics.mean[landmark] + statistics.std[landmark] * view.z[landmark]
         square = score**2 + statistics.std[landmark] ** 2 * (1 - view.certainty[landmark])
-        assert after.mean[landmark] == pytest.approx((4 * statistics.mean[landmark] + score) / 5)
-        assert after.square[landmark] == pytest.approx((4 * statistics.square[landmark] + square) / 5)
+        assert live.mean[landmark] == pytest.approx((4 * statistics.mean[landmark] + score) / 5)
+        assert live.square[landmark] == pytest.approx((4 * statistics.square[landmark] + square) / 5)
 
 
 def test_a_long_drive_of_short_lists_keeps_its_statistics_sane():
     """Views drawn as the statistics say, of which a tenth is sent: means and spreads stay where they were."""
     rng = np.random.default_rng(0)
-    usual = rng.normal(size=60)
-    drawn = usual + 0.7 * rng.normal(size=(600, 60))
+    mean_scores = rng.normal(size=60)
+    drawn = mean_scores + 0.7 * rng.normal(size=(600, 60))
     truth = LandmarkStatistics.of_map(rank_landmarks(drawn))
     live = replace(truth, weight=20.0)
     for row in drawn:
@@ -126,8 +126,8 @@ def test_a_long_drive_of_short_lists_keeps_its_statistics_sane():
 
 def test_far_beyond_what_is_usual_numbers_stay_numbers():
     for far in (-60.0, -30.0, 30.0, 60.0):
-        usual = LandmarkStatistics.from_mean_std(np.stack([np.full(5, far), np.full(5, 0.9)]))
-        view = usual.view(ranks_from_ranked_landmarks([2], 5))
+        statistics = LandmarkStatistics.from_mean_std(np.stack([np.full(5, far), np.full(5, 0.9)]))
+        view = statistics.view(ranks_from_ranked_landmarks([2], 5))
         assert np.isfinite(view.z).all()
         assert ((view.certainty >= 0) & (view.certainty <= 1)).all()
 

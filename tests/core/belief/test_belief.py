@@ -23,12 +23,12 @@ def route():
     return Route(np.arange(100.0))
 
 
-def seen(relevance, rule=UpdateRule.MIXTURE, scale=1.0, shared=0.0):
+def evidence_of(relevance, rule=UpdateRule.MIXTURE, scale=1.0, shared=0.0):
     return ViewEvidence.of(np.asarray(relevance, np.float32), rule, scale, shared)
 
 
 def holding(route, mass, lost=0.0, rule=UpdateRule.MIXTURE):
-    """A grid of such masses."""
+    """A grid belief with masses [c] in this proportion, lost with this probability."""
     start = GridFilter.uniform(route, rule)
     arrays = start.arrays()
     arrays["lost"] = np.full_like(arrays["lost"], lost)
@@ -43,14 +43,14 @@ def holding(route, mass, lost=0.0, rule=UpdateRule.MIXTURE):
 @pytest.mark.parametrize("kind", list(FilterKind))
 def test_a_view_that_answers_every_place_alike_changes_nothing(kind, rule, route):
     start = FILTERS[kind].uniform(route, rule=rule)
-    after = start.updated(seen(np.full(100, 0.7), rule), step=0)
-    np.testing.assert_allclose(after.mass, start.mass, atol=1e-3)
-    assert after.off_route == pytest.approx(0.02)
+    belief = start.updated(evidence_of(np.full(100, 0.7), rule), step=0)
+    np.testing.assert_allclose(belief.mass, start.mass, atol=1e-3)
+    assert belief.off_route == pytest.approx(0.02)
 
 
 def test_reciprocal_rank_shares_the_ranks_of_ties():
     belief = GridFilter.uniform(Route(np.arange(4.0)), UpdateRule.ADDITIVE_RECIPROCAL_RANK)
-    belief = belief.updated(seen([5, 1, 1, 0], UpdateRule.ADDITIVE_RECIPROCAL_RANK), step=0)
+    belief = belief.updated(evidence_of([5, 1, 1, 0], UpdateRule.ADDITIVE_RECIPROCAL_RANK), step=0)
     expected = 1 + 1 / np.array([1, 2.5, 2.5, 4])
     np.testing.assert_allclose(belief.mass, expected / expected.sum())
 
@@ -61,7 +61,7 @@ def test_relevances_of_any_size_leave_a_belief(kind, rule, route):
     """Those of `simbad` and `brute_force` are distances in whatever units encodings have."""
     belief = FILTERS[kind].uniform(route, rule=rule)
     for step in range(3):
-        belief = belief.updated(seen(-1e6 * np.arange(100.0), rule), step)
+        belief = belief.updated(evidence_of(-1e6 * np.arange(100.0), rule), step)
     assert belief.mass.sum() == pytest.approx(1)
     assert belief.mass.argmax() == 0
     assert 0 <= belief.off_route <= 1
@@ -71,28 +71,31 @@ def test_a_view_that_excludes_all_that_is_believed_changes_nothing(route):
     belief = holding(route, np.eye(100)[3], rule=UpdateRule.LOG_LIKELIHOOD)
     relevance = np.zeros(100)
     relevance[3] = -1e5
-    np.testing.assert_allclose(belief.updated(seen(relevance, UpdateRule.LOG_LIKELIHOOD), step=0).mass, belief.mass)
+    np.testing.assert_allclose(
+        belief.updated(evidence_of(relevance, UpdateRule.LOG_LIKELIHOOD), step=0).mass, belief.mass
+    )
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))
 def test_a_belief_at_a_wrong_place_goes_on_however_surely_views_exclude_it(kind, route):
-    """Without what is found on the way, more and more of it is lost, and none but for rounding is on the route."""
+    """Nothing is found on the way, so more and more is lost, and rounding alone leaves some on the route."""
     belief = FILTERS[kind].around(route, 20.0, 2.0, rule=UpdateRule.LOG_LIKELIHOOD)
     relevance = np.where(np.arange(100) < 80, 0.0, 500.0)
     for step in range(5):
-        belief = belief.updated(seen(relevance, UpdateRule.LOG_LIKELIHOOD), step)
+        belief = belief.updated(evidence_of(relevance, UpdateRule.LOG_LIKELIHOOD), step)
         belief = belief.predicted(1.0, 0.1, step + 1)
         assert belief.mass.sum() == pytest.approx(1)
     assert belief.off_route == pytest.approx(1)
 
 
 def error_matrix(n, action, std, closed=False, slipping=1.0):
-    """[n, n] where the mass of a cell comes to lie, of which none is lost at the ends; all in cells.
+    """[n, n] how the mass of every cell is spread by a move's error, none lost at the ends; all in cells.
 
-    Six moves of ten err as odometry says, the others by a fifth of the way more, or by a part of that.
+    Six moves of ten err as odometry says, the others by a fifth of the way besides, or by `slipping` of that.
     """
-    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    apart, whole, matrix = np.minimum(apart, n - apart) if closed else apart, np.abs(np.arange(-n, n + 1)), 0.0
+    distance = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    distance = np.minimum(distance, n - distance) if closed else distance
+    all_cells, matrix = np.abs(np.arange(-n, n + 1)), 0.0
     for share, deviation in ((0.6, std), (0.4, np.hypot(std, 0.2 * slipping * action))):
 
         def weight(cells, deviation=deviation):
@@ -100,7 +103,7 @@ def error_matrix(n, action, std, closed=False, slipping=1.0):
                 return np.where(cells == 0, 1 - deviation**2, np.where(cells == 1, deviation**2 / 2, 0))
             return np.where(cells <= 4 * deviation, np.exp(-0.5 * (cells / deviation) ** 2), 0)
 
-        matrix = matrix + share * weight(apart) / weight(whole).sum()
+        matrix = matrix + share * weight(distance) / weight(all_cells).sum()
     return matrix / matrix.sum(axis=1, keepdims=True)
 
 
@@ -117,12 +120,13 @@ def slow_mixture(route, views, moves, shared):
             carried[move:] = last[: n - move]
             news = (values - shared * carried) / (1 + shared)
             for t in range(3):
-                moved = np.zeros(n)
-                moved[move:] = masses[t][: n - move]
-                gone = lost[t] + masses[t].sum() - moved.sum()
+                shifted_mass = np.zeros(n)
+                shifted_mass[move:] = masses[t][: n - move]
+                lost_mass = lost[t] + masses[t].sum() - shifted_mass.sum()
                 leaving = 1 - np.exp(-0.0005 * move)
-                masses[t] = moved @ error_matrix(n, move, 0.0, slipping=0.0) * (1 - leaving) + 0.02 * gone / n
-                lost[t] = 0.98 * gone + leaving * moved.sum()
+                spread = shifted_mass @ error_matrix(n, move, 0.0, slipping=0.0)
+                masses[t] = spread * (1 - leaving) + 0.02 * lost_mass / n
+                lost[t] = 0.98 * lost_mass + leaving * shifted_mass.sum()
         last = values
         for t, trust in enumerate((0.5, 1.0, 2.0)):
             likelihood = np.exp(trust * news)
@@ -143,7 +147,7 @@ def test_a_mixture_is_three_trusts_weighed_by_what_they_predicted(shared):
     for step, (view, move) in enumerate(zip(views, moves, strict=True)):
         if step:
             belief = belief.predicted(float(move), 1e-6, step)
-        belief = belief.updated(seen(view, shared=shared if step else 0.0), step)
+        belief = belief.updated(evidence_of(view, shared=shared if step else 0.0), step)
     mass, lost = slow_mixture(route, views, moves, shared)
     np.testing.assert_allclose(belief.mass, mass, rtol=1e-3, atol=1e-6)
     assert belief.off_route == pytest.approx(lost, rel=1e-3)
@@ -156,8 +160,8 @@ def test_views_that_lie_are_trusted_less(route):
     for step in range(8):
         peak = 6.0 * (np.arange(100) == 10 + 5 * step)
         right, wrong = (belief.predicted(5.0, 0.2, step) if step else belief for belief in (right, wrong))
-        right = right.updated(seen(peak), step)
-        wrong = wrong.updated(seen(peak if step % 2 else 6.0 * (np.arange(100) == rng.integers(100))), step)
+        right = right.updated(evidence_of(peak), step)
+        wrong = wrong.updated(evidence_of(peak if step % 2 else 6.0 * (np.arange(100) == rng.integers(100))), step)
     assert right.doubt.trust.argmax() == 2
     assert wrong.doubt.trust[0] > right.doubt.trust[0]
 
@@ -165,12 +169,14 @@ def test_views_that_lie_are_trusted_less(route):
 @pytest.mark.parametrize("kind", list(FilterKind))
 def test_standing_still_is_one_view_however_often_it_is_taken(kind, route):
     view = np.random.default_rng(3).normal(size=100) * 2
-    once = FILTERS[kind].uniform(route).updated(seen(view), 0)
+    once = FILTERS[kind].uniform(route).updated(evidence_of(view), 0)
     often = once
     for step in range(1, 100):
-        often = often.predicted(0.0, 0.0, step).updated(seen(view, shared=1.0), step)
-    entropy, before = (-(mass[mass > 0] * np.log2(mass[mass > 0])).sum() for mass in (often.mass, once.mass))
-    assert entropy > before - 0.3, "it is no surer"
+        often = often.predicted(0.0, 0.0, step).updated(evidence_of(view, shared=1.0), step)
+    entropy_of_many, entropy_of_one = (
+        -(mass[mass > 0] * np.log2(mass[mass > 0])).sum() for mass in (often.mass, once.mass)
+    )
+    assert entropy_of_many > entropy_of_one - 0.3, "it is no surer"
     if kind is FilterKind.GRID:
         assert np.abs(often.mass - once.mass).sum() < 0.05
     assert often.mass.argmax() == once.mass.argmax()
@@ -189,20 +195,22 @@ def test_moves_blur_by_their_error_alone_however_images_stand():
     rng = np.random.default_rng(4)
     route = Route(np.cumsum(rng.uniform(0.3, 0.7, 400)))
     belief = GridFilter.around(route, 20.0, 2.0, UpdateRule.LOG_LIKELIHOOD)
-    before_m, before = moments(route, belief.mass)
+    start_m, start_variance = moments(route, belief.mass)
     for step in range(1, 101):
         belief = belief.predicted(0.37, 0.05, step)
-    after_m, after = moments(route, belief.mass)
-    assert after_m == pytest.approx(before_m + 37.0, abs=0.05)
-    assert after == pytest.approx(before + 100 * 0.05**2, rel=0.05)
+    mean_m, variance = moments(route, belief.mass)
+    assert mean_m == pytest.approx(start_m + 37.0, abs=0.05)
+    assert variance == pytest.approx(start_variance + 100 * 0.05**2, rel=0.05)
 
 
 def test_where_images_stand_evenly_whole_moves_shift_masses_and_views_are_heard_as_they_are(route):
     mass = np.random.default_rng(5).random(100)
-    moved = holding(route, mass, rule=UpdateRule.LOG_LIKELIHOOD).predicted(7.0, 0.0, step=1)
-    np.testing.assert_allclose(moved.mass[7:], mass[:93] / mass[:93].sum(), rtol=1e-9)
+    shifted_belief = holding(route, mass, rule=UpdateRule.LOG_LIKELIHOOD).predicted(7.0, 0.0, step=1)
+    np.testing.assert_allclose(shifted_belief.mass[7:], mass[:93] / mass[:93].sum(), rtol=1e-9)
     view = np.random.default_rng(6).normal(size=100)
-    belief = GridFilter.uniform(route, UpdateRule.LOG_LIKELIHOOD).updated(seen(view, UpdateRule.LOG_LIKELIHOOD), 0)
+    belief = GridFilter.uniform(route, UpdateRule.LOG_LIKELIHOOD).updated(
+        evidence_of(view, UpdateRule.LOG_LIKELIHOOD), 0
+    )
     expected = np.exp(view - view.max())
     np.testing.assert_allclose(belief.mass, expected / expected.sum(), rtol=1e-5)
 
@@ -216,25 +224,25 @@ def test_a_move_equals_its_definition(closed, action, std):
     cells = route.cells
     n = cells.n_cells
     mass = rng.random(n)
-    moved = holding(route, mass).predicted(action, std, step=1)
+    belief = holding(route, mass).predicted(action, std, step=1)
     shift = round(action / cells.step_m)
-    arrived, gone = np.zeros(n), 0.0
+    target_mass, past_mass = np.zeros(n), 0.0
     for cell, share in enumerate(mass / mass.sum()):
         target = cell + shift
         if not closed and not 0 <= target < n:
             offset_m = action - shift * cells.step_m
             past_m = (target - (n - 1)) * cells.step_m + offset_m if target >= n else -target * cells.step_m - offset_m
             if past_m > 4 * std + cells.step_m / 2:
-                gone += share
+                past_mass += share
                 continue
-        arrived[target % n if closed else min(max(target, 0), n - 1)] += share
+        target_mass[target % n if closed else min(max(target, 0), n - 1)] += share
     slipping = min(1.0, std / np.sqrt(0.05**2 + 0.01 * abs(action)))  # odometry more exact than usual slips less
-    spread = arrived @ error_matrix(n, action / cells.step_m, std / cells.step_m, closed, slipping)
-    lost = gone * 0.98 + (1 - np.exp(-0.0005 * abs(action))) * (1 - gone)
-    assert moved.off_route == pytest.approx(lost, rel=1e-6, abs=1e-12)
-    expected = spread * np.exp(-0.0005 * abs(action)) + 0.02 * gone / n
-    np.testing.assert_allclose(moved.masses[0] / moved.masses[0].sum(), expected / expected.sum(), atol=1e-6)
-    assert moved.mass.sum() == pytest.approx(1)
+    spread = target_mass @ error_matrix(n, action / cells.step_m, std / cells.step_m, closed, slipping)
+    lost = past_mass * 0.98 + (1 - np.exp(-0.0005 * abs(action))) * (1 - past_mass)
+    assert belief.off_route == pytest.approx(lost, rel=1e-6, abs=1e-12)
+    expected = spread * np.exp(-0.0005 * abs(action)) + 0.02 * past_mass / n
+    np.testing.assert_allclose(belief.masses[0] / belief.masses[0].sum(), expected / expected.sum(), atol=1e-6)
+    assert belief.mass.sum() == pytest.approx(1)
 
 
 def test_what_leads_past_the_end_is_lost(route):
@@ -247,17 +255,17 @@ def test_what_leads_past_the_end_is_lost(route):
 
 @pytest.mark.parametrize("std", [1.0, 5.0])
 def test_of_a_move_that_errs_past_both_ends_of_a_short_route_nothing_is_lost(std):
-    before = holding(Route(np.arange(4.0)), [1, 0, 2, 1], rule=UpdateRule.ADDITIVE_RELEVANCE)
-    after = before.predicted(0.0, std, step=1)
-    assert after.masses.sum() == pytest.approx(1)
+    start = holding(Route(np.arange(4.0)), [1, 0, 2, 1], rule=UpdateRule.ADDITIVE_RELEVANCE)
+    belief = start.predicted(0.0, std, step=1)
+    assert belief.masses.sum() == pytest.approx(1)
 
 
 def test_images_of_one_stop_share_what_arrives_there():
     route = Route(np.array([0.0, 1.0, 2.0, 2.0, 2.0, 3.0]))
-    moved = holding(route, [0, 1.0, 0, 0]).predicted(1.0, 0.0, step=1)
-    np.testing.assert_allclose(moved.mass, [0, 0, 1 / 3, 1 / 3, 1 / 3, 0], atol=1e-2)
-    stood = moved.predicted(0.0, 0.0, step=2)
-    np.testing.assert_allclose(stood.mass, moved.mass, atol=1e-9)
+    belief = holding(route, [0, 1.0, 0, 0]).predicted(1.0, 0.0, step=1)
+    np.testing.assert_allclose(belief.mass, [0, 0, 1 / 3, 1 / 3, 1 / 3, 0], atol=1e-2)
+    stood = belief.predicted(0.0, 0.0, step=2)
+    np.testing.assert_allclose(stood.mass, belief.mass, atol=1e-9)
 
 
 @pytest.mark.parametrize("n_gaps", [3, 20])
@@ -267,8 +275,8 @@ def test_gaps_of_a_kilometre_leave_neighbouring_images_apart(n_gaps):
     steps_m[np.linspace(20, 250, n_gaps).astype(int)] = 1000.0
     route = Route(np.cumsum(steps_m))
     belief = GridFilter.around(route, float(route.position_m[270]), 0.5)
-    for step, at in enumerate(range(271, 280), start=1):
-        belief = belief.predicted(1.0, 0.1, step).updated(seen(4.0 * (np.arange(300) == at)), step)
+    for step, image in enumerate(range(271, 280), start=1):
+        belief = belief.predicted(1.0, 0.1, step).updated(evidence_of(4.0 * (np.arange(300) == image)), step)
     assert belief.mass.argmax() == 279
     assert belief.mass[279] > 0.9
     assert belief.masses.shape[1] < 40_000
@@ -285,9 +293,9 @@ def test_a_robot_in_a_gap_is_by_the_nearest_image(closed):
 
 @pytest.mark.parametrize("kind", list(FilterKind))
 def test_a_closed_route_of_no_length_is_moved_along(kind):
-    belief = FILTERS[kind].uniform(Route(np.array([5.0, 5.0]), closed=True)).updated(seen([0.0, 1.0]), 0)
-    after = belief.predicted(1.0, 0.1, 1).updated(seen([0.0, 1.0], shared=0.5), 1)
-    np.testing.assert_allclose(after.mass, 0.5)
+    belief = FILTERS[kind].uniform(Route(np.array([5.0, 5.0]), closed=True)).updated(evidence_of([0.0, 1.0]), 0)
+    next_belief = belief.predicted(1.0, 0.1, 1).updated(evidence_of([0.0, 1.0], shared=0.5), 1)
+    np.testing.assert_allclose(next_belief.mass, 0.5)
 
 
 def test_a_prior_narrower_than_the_spacing_keeps_its_nearest_image(route):
@@ -298,36 +306,36 @@ def test_a_prior_narrower_than_the_spacing_keeps_its_nearest_image(route):
 @pytest.mark.parametrize("kind", list(FilterKind))
 @pytest.mark.parametrize("rule", sorted(set(UpdateRule) - {UpdateRule.MIXTURE}))
 def test_to_the_papers_updates_a_move_past_the_end_is_impossible_and_nobody_is_lost(kind, rule, route):
-    moved = FILTERS[kind].uniform(route, rule=rule).predicted(20.0, 1e-6, step=1)
-    assert moved.off_route == pytest.approx(0.02)
-    assert moved.mass[:20].sum() == pytest.approx(0, abs=1e-9)
-    assert moved.mass[20:].sum() == pytest.approx(1)
+    belief = FILTERS[kind].uniform(route, rule=rule).predicted(20.0, 1e-6, step=1)
+    assert belief.off_route == pytest.approx(0.02)
+    assert belief.mass[:20].sum() == pytest.approx(0, abs=1e-9)
+    assert belief.mass[20:].sum() == pytest.approx(1)
     with pytest.raises(PastTheEndError):
-        moved.predicted(120.0, 0.3, step=2)
+        belief.predicted(120.0, 0.3, step=2)
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_odometry_that_is_a_tenth_off_loses_no_robot(kind, factor):
     route, rng = Route(np.arange(300.0)), np.random.default_rng(4)
-    belief, held = FILTERS[kind].around(route, 2.0, 0.5), []
-    for step, at in enumerate(range(2, 290, 6)):
+    belief, is_held = FILTERS[kind].around(route, 2.0, 0.5), []
+    for step, image in enumerate(range(2, 290, 6)):
         belief = belief.predicted(6.0 * factor, 0.25, step) if step else belief
-        view = 0.4 * rng.normal(size=300) + 3.0 * np.exp(-0.5 * np.square((route.position_m - at) / 1.2))
-        belief = belief.updated(seen(view), step)
+        view = 0.4 * rng.normal(size=300) + 3.0 * np.exp(-0.5 * np.square((route.position_m - image) / 1.2))
+        belief = belief.updated(evidence_of(view), step)
         descending = np.sort(belief.mass)[::-1]
-        least = descending[(np.cumsum(descending) < 0.95).sum()]
-        held.append(belief.mass[at] >= least)
-    assert np.mean(held) > 0.9
+        least_mass = descending[(np.cumsum(descending) < 0.95).sum()]
+        is_held.append(belief.mass[image] >= least_mass)
+    assert np.mean(is_held) > 0.9
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))
 def test_a_robot_that_has_moved_may_always_have_been_carried(kind, route):
     """It is sure to be at the end, and moves on by 20 m."""
     belief = FILTERS[kind].around(route, 80.0, 0.5)
-    for step, at in enumerate((80, 85, 90, 95)):
+    for step, image in enumerate((80, 85, 90, 95)):
         belief = belief.predicted(5.0, 0.2, step) if step else belief
-        belief = belief.updated(seen(9.0 * (np.arange(100) == at)), step)
+        belief = belief.updated(evidence_of(9.0 * (np.arange(100) == image)), step)
     assert belief.off_route < 0.01
     assert belief.predicted(20.0, 0.3, 4).off_route > 0.9
 
@@ -346,34 +354,34 @@ def test_what_a_move_found_is_there_until_a_view_says_where(route):
 def test_a_robot_that_was_carried_is_found_again(kind, route):
     """Every place looks like itself; the robot moves on by 5 m, and once, without a word, by 50."""
     rng = np.random.default_rng(0)
-    belief, at, found, doubted = FILTERS[kind].around(route, 5.0, 1.0), 5, [], 0.0
+    belief, image, is_found, doubt = FILTERS[kind].around(route, 5.0, 1.0), 5, [], 0.0
     for step in range(16):
         if step:
-            at = (at + (50 if step == 5 else 5)) % 100
-            belief = belief.predicted(5.0, 0.2, step) if at >= 5 else FILTERS[kind].around(route, at, 1.0)
+            image = (image + (50 if step == 5 else 5)) % 100
+            belief = belief.predicted(5.0, 0.2, step) if image >= 5 else FILTERS[kind].around(route, image, 1.0)
         view = 0.5 * rng.normal(size=100)
-        view[at] += 4
-        belief = belief.updated(seen(view), step)
+        view[image] += 4
+        belief = belief.updated(evidence_of(view), step)
         if 5 <= step <= 13:
-            found.append(abs(int(belief.mass.argmax()) - at) <= 2)
-            doubted = max(doubted, belief.off_route)
-    assert doubted > (0.2 if kind is FilterKind.GRID else 0.1)
-    assert sum(found[:6]) >= 3
-    assert all(found[4:])
+            is_found.append(abs(int(belief.mass.argmax()) - image) <= 2)
+            doubt = max(doubt, belief.off_route)
+    assert doubt > (0.2 if kind is FilterKind.GRID else 0.1)
+    assert sum(is_found[:6]) >= 3
+    assert all(is_found[4:])
 
 
 def test_a_robot_off_the_route_is_called_lost_and_one_on_it_is_not(route):
     rng = np.random.default_rng(1)
     on, off = GridFilter.around(route, 10.0, 1.0), GridFilter.around(route, 10.0, 1.0)
-    doubted = []
+    doubts = []
     for step in range(1, 12):
         on, off = on.predicted(5.0, 0.2, step), off.predicted(5.0, 0.2, step)
         noise = 0.5 * rng.normal(size=(2, 100))
         noise[0, 10 + 5 * step] += 4
         noise[1, rng.integers(100)] += 4  # what it sees there looks like anything
-        on, off = on.updated(seen(noise[0]), step), off.updated(seen(noise[1]), step)
-        doubted.append((on.off_route, off.off_route))
-    of_on, of_off = np.array(doubted).max(axis=0)
+        on, off = on.updated(evidence_of(noise[0]), step), off.updated(evidence_of(noise[1]), step)
+        doubts.append((on.off_route, off.off_route))
+    of_on, of_off = np.array(doubts).max(axis=0)
     assert of_on < 0.02
     assert of_off > 0.05
 
@@ -382,10 +390,10 @@ def test_a_robot_off_the_route_is_called_lost_and_one_on_it_is_not(route):
 
 
 def in_finer_cells(route, factor):
-    """The route, with so many cells where it has one."""
-    usual, finer = route.cells, Route(route.position_m, route.closed)
-    n_cells = usual.n_cells * factor - (0 if route.closed else factor - 1)
-    finer.__dict__["cells"] = replace(usual, step_m=usual.step_m / factor, n_cells=n_cells)
+    """The route with `factor` cells in place of each."""
+    cells, finer = route.cells, Route(route.position_m, route.closed)
+    n_cells = cells.n_cells * factor - (0 if route.closed else factor - 1)
+    finer.__dict__["cells"] = replace(cells, step_m=cells.step_m / factor, n_cells=n_cells)
     return finer
 
 
@@ -401,18 +409,18 @@ def test_particles_come_near_the_exact_filter_as_they_grow(rule, closed):
     exact_route = route if rule in ADDITIVE else in_finer_cells(route, 8)
     views = np.random.default_rng(1).normal(size=(4, 60)) * 2
     moves = (3.0, 7.0, 2.0)
-    apart = []
+    differences = []
     for n_particles in (300, 30_000):
         exact, sampled = GridFilter.uniform(exact_route, rule), ParticleFilter.uniform(route, n_particles, 3, rule)
         for step, view in enumerate(views):
             if step:
                 exact = exact.predicted(moves[step - 1], 1.0, step)
                 sampled = sampled.predicted(moves[step - 1], 1.0, step)
-            said = seen(view, rule, shared=0.5 if step else 0.0)
-            exact, sampled = exact.updated(said, step), sampled.updated(said, step)
-        apart.append(np.abs(exact.mass - sampled.mass).sum() / 2)
-    assert apart[1] < 0.04
-    assert apart[1] < apart[0] / 3
+            evidence = evidence_of(view, rule, shared=0.5 if step else 0.0)
+            exact, sampled = exact.updated(evidence, step), sampled.updated(evidence, step)
+        differences.append(np.abs(exact.mass - sampled.mass).sum() / 2)
+    assert differences[1] < 0.04
+    assert differences[1] < differences[0] / 3
     assert sampled.off_route == pytest.approx(exact.off_route, abs=0.01)
 
 
@@ -420,7 +428,7 @@ def test_particles_come_near_the_exact_filter_as_they_grow(rule, closed):
 def test_a_view_is_heard_of_between_images_as_the_way_leads_to_the_other(kind):
     """Images of one stop say what they say on average."""
     route = Route(np.array([0.0, 0.0, 8.0, 16.0]))
-    belief = FILTERS[kind].uniform(in_finer_cells(route, 64)).updated(seen([3.0, 5.0, 0.0, 0.0]), 0)
+    belief = FILTERS[kind].uniform(in_finer_cells(route, 64)).updated(evidence_of([3.0, 5.0, 0.0, 0.0]), 0)
     expected, on_the_way = 0.0, 4 * (1 - np.arange(0.5, 512) / 512)  # from one place to the next
     for trust, probable in ((0.5, 0.2), (1.0, 0.4), (2.0, 0.4)):
         likelihood = np.exp(trust * on_the_way)
@@ -445,25 +453,27 @@ def test_cells_of_a_loop_hear_of_a_view_between_the_places_beside_them(gap_m, of
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("offset", [-0.5, -0.2, 0.0, 0.3, 0.5])
 def test_cells_that_are_places_are_as_others(n, closed, offset):
-    """Of places at equal distances nothing is looked for; one that is off by a hair makes them be looked for."""
+    """Places at equal distances are the cells; one that is off by a hair makes every cell be looked up."""
     values, place_m = np.random.default_rng(0).random(n), 5 + 0.2 * np.arange(n)
     off_m = place_m + 1e-5 * (np.arange(n) == n - 1)
-    same, looked_for = (Cells.for_places(at_m, 0.2 * (n if closed else n - 1), closed) for at_m in (place_m, off_m))
-    assert same.are_places
-    assert not looked_for.are_places
-    for of in ("of_places", "to_places"):
-        given = [getattr(cells, of)(values, offset * 0.2) for cells in (same, looked_for)]
-        np.testing.assert_allclose(*given, atol=1e-3)
+    even_cells, uneven_cells = (
+        Cells.for_places(at_m, 0.2 * (n if closed else n - 1), closed) for at_m in (place_m, off_m)
+    )
+    assert even_cells.are_places
+    assert not uneven_cells.are_places
+    for method in ("of_places", "to_places"):
+        results = [getattr(cells, method)(values, offset * 0.2) for cells in (even_cells, uneven_cells)]
+        np.testing.assert_allclose(*results, atol=1e-3)
 
 
 def test_the_same_seed_and_steps_give_the_same_bits():
     route = Route(np.arange(30.0))
 
     def run(seed, restore):
-        belief = ParticleFilter.uniform(route, 200, seed).updated(seen(np.linspace(0, 12, 30)), 0)
+        belief = ParticleFilter.uniform(route, 200, seed).updated(evidence_of(np.linspace(0, 12, 30)), 0)
         if restore:
             belief = ParticleFilter.from_arrays(route, belief.arrays(), seed)
-        return belief.predicted(2.0, 0.5, 1).updated(seen(np.linspace(0, 12, 30)), 1).arrays()
+        return belief.predicted(2.0, 0.5, 1).updated(evidence_of(np.linspace(0, 12, 30)), 1).arrays()
 
     first, again, other = run(5, restore=False), run(5, restore=True), run(6, restore=False)
     assert all(first[name].tobytes() == again[name].tobytes() for name in first)
@@ -472,7 +482,7 @@ def test_the_same_seed_and_steps_give_the_same_bits():
 
 def test_no_place_has_less_than_nothing():
     belief = ParticleFilter.around(Route(np.arange(150.0)), 59.0, 2.0, seed=1)
-    assert belief.updated(seen(3 * np.cos(np.arange(150.0))), 0).mass.min() == 0
+    assert belief.updated(evidence_of(3 * np.cos(np.arange(150.0))), 0).mass.min() == 0
 
 
 def test_particles_past_the_end_of_an_open_route_die():
@@ -485,6 +495,6 @@ def test_particles_past_the_end_of_an_open_route_die():
 def test_moves_said_to_be_exact_spread_nothing():
     """And those said to be more exact than odometry usually is spread less."""
     route = Route(np.arange(200.0))
-    before = GridFilter.around(route, 50.0, 0.01)
-    held = [before.predicted(10.0, std_m, step=1).mass[60] for std_m in (0.0, 0.1, motion_std_m(10.0))]
-    assert held[0] > 0.97 > 0.9 > held[1] > 0.75 > held[2]
+    start = GridFilter.around(route, 50.0, 0.01)
+    masses = [start.predicted(10.0, std_m, step=1).mass[60] for std_m in (0.0, 0.1, motion_std_m(10.0))]
+    assert masses[0] > 0.97 > 0.9 > masses[1] > 0.75 > masses[2]

@@ -54,8 +54,8 @@ def test_on_a_closed_route_mean_deviation_and_set_cross_the_start():
 
 def test_of_a_map_of_one_image():
     route = Route(np.array([5.0]))
-    seen = ViewEvidence.of(np.array([1.0], np.float32), UpdateRule.LOG_LIKELIHOOD, 1.0)
-    belief = GridFilter.uniform(route, UpdateRule.LOG_LIKELIHOOD).updated(seen, step=0)
+    evidence = ViewEvidence.of(np.array([1.0], np.float32), UpdateRule.LOG_LIKELIHOOD, 1.0)
+    belief = GridFilter.uniform(route, UpdateRule.LOG_LIKELIHOOD).updated(evidence, step=0)
     summary = summarise(route, belief.mass, 10, belief.off_route)
     assert (summary.mean_m, summary.mode_m, summary.std_m, summary.entropy_bits) == (5, 5, 0, 0)
     assert summary.credible_95_m == (5.0, 5.0)
@@ -72,6 +72,6 @@ def test_the_set_is_the_smallest_that_holds_its_share(values, closed):
         x = route.position_m
         member |= (x >= low) & (x <= high) if low <= high else (x >= low) | (x <= high)
     descending = np.sort(mass)[::-1]
-    needed = int(np.searchsorted(np.cumsum(descending), 0.95 - 1e-9)) + 1
+    n_needed = int(np.searchsorted(np.cumsum(descending), 0.95 - 1e-9)) + 1
     assert mass[member].sum() >= 0.95 - 1e-6
-    assert (mass[member] >= descending[needed - 1] - 1e-12).sum() >= needed
+    assert (mass[member] >= descending[n_needed - 1] - 1e-12).sum() >= n_needed

@@ -80,28 +80,28 @@ ACTIONS_M = (1.0, 2.0, 5.0)
 def world():
     rng = np.random.default_rng(2)
     places = rng.normal(size=(N, R))
-    mapped, live = (places + 1.5 * rng.normal(size=(2, N, R))).astype(np.float32)
-    built = a_map(Relevance.STANDARDISED, mapped, 4, actions_m=ACTIONS_M)
-    ranks = live.argsort(axis=1).argsort(axis=1).astype(np.float32) + 1
-    return built, ranks
+    map_dissimilarities, live_dissimilarities = (places + 1.5 * rng.normal(size=(2, N, R))).astype(np.float32)
+    map_ = a_map(Relevance.STANDARDISED, map_dissimilarities, 4, actions_m=ACTIONS_M)
+    ranks = live_dissimilarities.argsort(axis=1).argsort(axis=1).astype(np.float32) + 1
+    return map_, ranks
 
 
 def walk_of(ranks, frames, **changes):
-    moved = np.r_[0.0, np.diff(frames)]
+    action_m = np.r_[0.0, np.diff(frames)]
     parts = {
         "queries": [Query(ranks[frame]) for frame in frames],
-        "action_m": moved,
+        "action_m": action_m,
         "true_position_m": np.array(frames, float),
     }
     return KnownWalk(**(parts | changes))
 
 
 def test_rewards_and_neighbours_are_those_of_training_on_the_same_moves(world):
-    built, ranks = world
+    map_, ranks = world
     config = NnqlConfig(top_share=0.03, motion_std_m=0.33, n_neighbours=3, update=UpdateRule.LOG_LIKELIHOOD)
     frames = [4, 9, 10, 12, 17, 22, 27, 28, 33]
-    moves = transitions_of(built, walk_of(ranks, frames), config)
-    training = Walk(TrainingWorld.on(built, Query(ranks), built.route, np.arange(N), config), np.array([4]))
+    moves = transitions_of(map_, walk_of(ranks, frames), config)
+    training = Walk(TrainingWorld.on(map_, Query(ranks), map_.route, np.arange(N), config), np.array([4]))
     rewards = []
     for t, action in enumerate([2, 0, 1, 2, 2, 2, 0, 2]):
         assert moves.action[t] == action
@@ -115,50 +115,52 @@ def test_rewards_and_neighbours_are_those_of_training_on_the_same_moves(world):
 
 
 def test_a_rank_counts_from_0_and_must_lie_below_the_share(world):
-    built, ranks = world
+    map_, ranks = world
     walk = walk_of(ranks, [4, 9, 10, 12, 17, 22, 27, 28, 33])
-    first_alone, nobody = (transitions_of(built, walk, NnqlConfig(top_share=share)).reward for share in (1 / N, 0.0))
-    assert first_alone.any()
-    assert not nobody.any()
+    first_rewards, no_rewards = (
+        transitions_of(map_, walk, NnqlConfig(top_share=share)).reward for share in (1 / N, 0.0)
+    )
+    assert first_rewards.any()
+    assert not no_rewards.any()
 
 
 def test_moves_that_are_no_action_or_lead_nobody_knows_where_teach_nothing(world):
-    built, ranks = world
+    map_, ranks = world
     frames = [4, 9, 12, 13, 23, 24, 24, 25]  # 5, 3 (nearer to 2 than half a step: no), 1, 10, 1, 0, 1
-    known = np.array(frames, float)
-    known[5] = np.nan
-    moves = transitions_of(built, walk_of(ranks, frames, true_position_m=known), NnqlConfig())
+    true_m = np.array(frames, float)
+    true_m[5] = np.nan
+    moves = transitions_of(map_, walk_of(ranks, frames, true_position_m=true_m), NnqlConfig())
     assert moves.action.tolist() == [2, 0, 0]
-    nothing = transitions_of(built, walk_of(ranks, [7]), NnqlConfig())
-    assert nothing.action.size == 0
+    no_moves = transitions_of(map_, walk_of(ranks, [7]), NnqlConfig())
+    assert no_moves.action.size == 0
     empty = KnownWalk([], np.empty(0), np.empty(0))
-    assert transitions_of(built, empty, NnqlConfig()).nearest.shape == (0, 4)
+    assert transitions_of(map_, empty, NnqlConfig()).nearest.shape == (0, 4)
     q_values = initial_q_values(N, 3, NnqlConfig())
-    learn(q_values, nothing, NnqlConfig())
+    learn(q_values, no_moves, NnqlConfig())
     assert (q_values == np.float32(1e-4)).all()
 
 
 def test_the_end_of_the_route(world):
-    built, ranks = world
-    moves = transitions_of(built, walk_of(ranks, [55, 57, 58, 59]), NnqlConfig())
+    map_, ranks = world
+    moves = transitions_of(map_, walk_of(ranks, [55, 57, 58, 59]), NnqlConfig())
     assert moves.next_allowed.tolist() == [[True, True, False], [True, False, False], [False, False, False]]
 
 
 def test_a_belief_wholly_past_the_end_begins_anew(world):
     """To the paper's updates, which know nobody who is lost."""
-    built, ranks = world
-    odd = walk_of(ranks, [10, 15, 20], action_m=np.array([0.0, 300.0, 5.0]))
+    map_, ranks = world
+    walk = walk_of(ranks, [10, 15, 20], action_m=np.array([0.0, 300.0, 5.0]))
     config = NnqlConfig(top_share=0.05, update=UpdateRule.LOG_LIKELIHOOD)
-    moves = transitions_of(built, odd, config)
+    moves = transitions_of(map_, walk, config)
     assert moves.action.tolist() == [2]
-    live, belief = built.live_statistics.observing(Query(ranks[10])), GridFilter.uniform(built.route, config.update)
+    live, belief = map_.live_statistics.observing(Query(ranks[10])), GridFilter.uniform(map_.route, config.update)
     for t, frame in enumerate((15, 20)):
         live = live.observing(Query(ranks[frame]))
         belief = belief.predicted(5.0, np.sqrt(0.05**2 + 0.01 * 5), 0) if t else belief
-        relevance = relevances(built, Query(ranks[frame]), live)
+        relevance = relevances(map_, Query(ranks[frame]), live)
         belief = belief.updated(ViewEvidence.of(relevance, config.update, 0.3), 0)
-    earned = rank_of_truth(belief.mass, np.array([20])) < 0.05 * N
-    assert moves.reward.tolist() == [100.0 * earned]
+    is_rewarded = rank_of_truth(belief.mass, np.array([20])) < 0.05 * N
+    assert moves.reward.tolist() == [100.0 * is_rewarded]
 
 
 def test_one_position_a_view(world):

@@ -20,19 +20,19 @@ BACK_AND_FORTH_M = (-2.0, 0.0, 3.0)
 
 
 def random_world(
-    config: NnqlConfig, closed: bool = False, known: float = 1.0, actions_m: tuple[float, ...] = ACTIONS_M
+    config: NnqlConfig, closed: bool = False, known_share: float = 1.0, actions_m: tuple[float, ...] = ACTIONS_M
 ) -> TrainingWorld:
     rng = np.random.default_rng(5)
     n, r = 80, 15
-    mapped, live = rng.normal(size=(2, n, r)).astype(np.float32)
-    map_ = a_map(Relevance.RRF, mapped, 4, closed=closed, actions_m=actions_m)
-    views = Query(live.argsort(axis=1).argsort(axis=1) + np.float32(1))
-    true_image = np.where(rng.random(n) < known, np.arange(n), -1)
+    map_dissimilarities, live_dissimilarities = rng.normal(size=(2, n, r)).astype(np.float32)
+    map_ = a_map(Relevance.RRF, map_dissimilarities, 4, closed=closed, actions_m=actions_m)
+    views = Query(live_dissimilarities.argsort(axis=1).argsort(axis=1) + np.float32(1))
+    true_image = np.where(rng.random(n) < known_share, np.arange(n), -1)
     return TrainingWorld.on(map_, views, map_.route, true_image, config)
 
 
-def moved(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarray:
-    """A metre an image; what would be past an end of an open route is dropped."""
+def mass_after_move(mass: np.ndarray, metres: int, std_m: float, closed: bool) -> np.ndarray:
+    """The mass after a move, of images a metre apart; what would be past an end of an open route is dropped."""
     n, reach = len(mass), max(1, int(4 * std_m))
     shifted = np.roll(mass, metres)
     if not closed and metres > 0:
@@ -61,8 +61,8 @@ def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.
 
         def look(belief, frame):
             relevance = relevances(world.map, world.views.at(frame))
-            seen = belief * n + np.maximum(relevance, 0)
-            return seen / seen.sum(), shortlist(relevance, config.n_neighbours)
+            weights = belief * n + np.maximum(relevance, 0)
+            return weights / weights.sum(), shortlist(relevance, config.n_neighbours)
 
         belief, near = look(belief, frame)
         for _ in range(config.n_actions_per_episode):
@@ -71,27 +71,27 @@ def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.
             if action < 0:
                 break
             frame = int(frame + actions_m[action]) % n
-            belief = moved(belief, int(actions_m[action]), config.motion_std_m, closed)
-            belief, then = look(belief, frame)
+            belief = mass_after_move(belief, int(actions_m[action]), config.motion_std_m, closed)
+            belief, next_near = look(belief, frame)
             if world.true_image[frame] >= 0:
                 rank = rank_of_truth(belief, np.array([frame]))
                 reward = config.reward if rank < config.top_share * n else 0.0
-                then_allowed = [a for a, m in enumerate(actions_m) if closed or 0 <= frame + m <= n - 1]
-                best = max((q_values[then, a].mean() for a in then_allowed), default=0.0)
+                next_allowed = [a for a, m in enumerate(actions_m) if closed or 0 <= frame + m <= n - 1]
+                best = max((q_values[next_near, a].mean() for a in next_allowed), default=0.0)
                 target = reward + config.discount * best
                 for image in near:
                     q_values[image, action] += config.learning_rate * (target - q_values[image, action])
-            near = then
+            near = next_near
     return q_values
 
 
 @pytest.mark.parametrize(
-    ("closed", "known", "actions_m"),
+    ("closed", "known_share", "actions_m"),
     [(False, 1.0, ACTIONS_M), (True, 0.6, ACTIONS_M), (False, 1.0, BACK_AND_FORTH_M), (True, 1.0, BACK_AND_FORTH_M)],
 )
-def test_the_same_values_as_plain_loops(closed, known, actions_m):
+def test_the_same_values_as_plain_loops(closed, known_share, actions_m):
     config = NnqlConfig(n_episodes=60, batch_episodes=1, motion_std_m=0.33, top_share=0.2, exploration=0.5, seed=3)
-    world = random_world(config, closed, known, actions_m)
+    world = random_world(config, closed, known_share, actions_m)
     learnt, _ = train(world, config, lambda _: None)
     expected = slow_training(world, config, closed)
     assert (expected > 1).any()
@@ -113,16 +113,16 @@ def test_the_seed_decides_and_threads_do_not():
 
 def test_a_cancel_ends_training_between_two_batches():
     config = NnqlConfig(n_episodes=300)
-    seen: list[float] = []
+    shares: list[float] = []
 
     def cancel(share: float) -> None:
-        seen.append(share)
+        shares.append(share)
         if share > 0.5:
             raise CancelledError("asked to stop")
 
     with pytest.raises(CancelledError):
         train(random_world(config), config, cancel)
-    assert seen == [pytest.approx(1 / 3), pytest.approx(2 / 3)]
+    assert shares == [pytest.approx(1 / 3), pytest.approx(2 / 3)]
 
 
 def test_no_episodes_teach_nothing():

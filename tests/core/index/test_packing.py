@@ -65,17 +65,17 @@ def test_what_neighbours_share_and_what_is_alike_costs_less():
 def test_appending_changes_no_block_but_the_last(monkeypatch):
     monkeypatch.setattr(packing, "BLOCK", 100)
     lists = nearest(450)
-    whole, part = comes_back(lists, 60, PROTOTYPES), comes_back(lists[:, :330], 60, PROTOTYPES)
-    assert (len(whole), len(part)) == (5, 4)
-    assert whole[:3] == part[:3]
-    assert whole[3] != part[3]
+    all_blocks, first_blocks = comes_back(lists, 60, PROTOTYPES), comes_back(lists[:, :330], 60, PROTOTYPES)
+    assert (len(all_blocks), len(first_blocks)) == (5, 4)
+    assert all_blocks[:3] == first_blocks[:3]
+    assert all_blocks[3] != first_blocks[3]
 
 
 def test_blocks_that_are_not_of_such_lists_are_refused():
     blocks = pack_lists(nearest(300), 60, PROTOTYPES)
-    for some in ([], [b""], [blocks[0][:-3]], [blocks[0] + b"\0"], [*blocks, blocks[0]]):
+    for bad_blocks in ([], [b""], [blocks[0][:-3]], [blocks[0] + b"\0"], [*blocks, blocks[0]]):
         with pytest.raises(ValueError, match="block"):
-            unpack_lists(some, 4, 300, 60, PROTOTYPES)
+            unpack_lists(bad_blocks, 4, 300, 60, PROTOTYPES)
     for list_length, n_images in ((0, 300), (61, 300), (4, 0), (4, 10**9)):
         with pytest.raises(ValueError, match="blocks are not those"):
             unpack_lists(blocks, list_length, n_images, 60, PROTOTYPES)
