@@ -13,7 +13,7 @@ def main() -> None:
         sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[replay]'\n")
         sys.exit(1)
     try:
-        from deepsimbad_client.commands import run  # noqa: PLC0415 - only now is it known to be there
+        from deepsimbad_client.commands import run  # noqa: PLC0415 - only now are its packages known to be installed
 
         code = run()
     except KeyboardInterrupt:  # while it was loaded, which takes a second

@@ -1,4 +1,4 @@
-"""Every error the client raises, in one tree: of recordings, of the network, of the service's answers."""
+"""The tree of all errors that the client raises: of recordings, of the network, of the service's answers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -39,7 +39,7 @@ class SourceError(DeepSimbadClientError, code="invalid_source"):
 
 
 class BrokenFrameError(SourceError, code="broken_frame"):
-    """One frame of a recording that cannot be read; `reason` is the words to count it under, beside `left_out`."""
+    """One frame of a recording that cannot be read; it is counted under the words `reason`, as in `left_out`."""
 
     def __init__(self, message: str, reason: str = "undecodable") -> None:
         super().__init__(message)
@@ -51,7 +51,7 @@ class TooManyLeftOutError(SourceError, code="frames_left_out"):
 
 
 class OtherFramesError(SourceError, code="other_frames"):
-    """A recording whose frames are others than those that its traverse holds; `names` are of the first that differ."""
+    """A recording whose frames differ from those that its traverse holds; `names` are those of differing frames."""
 
     def __init__(self, message: str, names: Sequence[str]) -> None:
         super().__init__(message)
@@ -75,7 +75,7 @@ class UnexpectedAnswerError(DeepSimbadClientError, code="unexpected_answer"):
 
 
 class DamagedDownloadError(DeepSimbadClientError, code="damaged_download"):
-    """A file that came has another digest than the service named."""
+    """A downloaded file with another digest than the service named."""
 
 
 class NotSavedError(DeepSimbadClientError, code="not_saved"):
@@ -106,7 +106,7 @@ class ApiError(DeepSimbadClientError):
     """The service answered with an error (RFC 9457 problem details).
 
     `code` is the problem's stable code word (`http_<status>` when the answer held none), `problem` the whole document,
-    `request_id` what its operator finds the request by, `retry_after_s` the seconds it asked to wait.
+    `request_id` the request's id in the service's log, `retry_after_s` the seconds that the service asks to wait.
     """
 
     _advice = ""
@@ -138,7 +138,7 @@ class ApiError(DeepSimbadClientError):
 
     @property
     def advice(self) -> str:
-        """What the caller can do about it, where the service may not have said so; "" where there is nothing to add."""
+        """Words for what the caller can do about the error; "" where there is nothing to add to the message."""
         return self._advice.format_map({"needed": "admin", "map_version": None, **self.problem})
 
     def __str__(self) -> str:
@@ -200,7 +200,7 @@ class LandmarkModelDiffersError(
 
 
 class FramesDifferError(ConflictError, code="frames_differ"):
-    """Frames that may replace none differ from those of their indices that are there."""
+    """Frames sent without `replace` differ from the stored ones of their indices."""
 
 
 class TraverseInUseError(ConflictError, code="traverse_in_use"):
@@ -240,7 +240,7 @@ class InvalidPriorError(InvalidInputError, code="invalid_prior"):
 
 
 class IdempotencyKeyReusedError(InvalidInputError, code="idempotency_key_reused"):
-    """The idempotency key came before with another request."""
+    """The idempotency key was used before for another request."""
 
 
 class RateLimitedError(ApiError, status=429, code="rate_limited"):
@@ -264,5 +264,5 @@ class DamagedMapError(UnavailableError, code="damaged_map"):
 
 
 def api_error_class(status: int, code: str) -> type[ApiError]:
-    """The class of an answer: by its code word, else by its status, else by its hundred."""
+    """The class of an error answer: by its code word, else by its status, else by the hundred of its status."""
     return BY_CODE.get(code) or BY_STATUS.get(status) or (ServerError if status >= 500 else ApiError)

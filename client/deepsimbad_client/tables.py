@@ -1,4 +1,4 @@
-"""Tables on standard output: whole, however narrow the terminal is."""
+"""Tables on standard output, never cut, however narrow the terminal is."""
 
 import os
 
@@ -7,21 +7,21 @@ from rich.measure import Measurement
 from rich.table import Table
 
 PIPE_COLUMNS = 160
-_UNBOUNDED = 100_000  # columns: as wide as it would like to be
+_UNBOUNDED = 100_000  # columns, for a table's natural width
 
 
 def print_whole(table: Table, console: Console) -> None:
-    """Print a table; where it does not fit a line a cell, since rich would cut names and leave columns out."""
+    """Print a table; one too wide is printed with a line for each cell, since rich would cut names and drop columns."""
     if table.title and not table.row_count:
         console.print(f"{table.title}: none")
         return
     width = Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = max(PIPE_COLUMNS, width)
-    console.print(table if width <= console.width or not table.show_header else _down(table))
+    console.print(table if width <= console.width or not table.show_header else _cell_lines(table))
 
 
-def _down(table: Table) -> Table:
+def _cell_lines(table: Table) -> Table:
     lines = Table.grid(padding=(0, 2))
     lines.title, lines.title_justify, lines.caption, lines.caption_justify = table.title, "left", table.caption, "left"
     lines.add_column(style="dim")

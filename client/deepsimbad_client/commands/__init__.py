@@ -1,4 +1,4 @@
-"""The commands of `deepsimbad-client`, and what becomes of their errors.
+"""The commands of `deepsimbad-client`, and the exit codes of their errors.
 
 Exit codes: 0 done, 1 a named error (one line on standard error), 2 wrong usage, 130 cancelled. Results go to standard
 output, progress and remarks to standard error.
@@ -40,9 +40,9 @@ for command in COMMANDS:
 
 
 def resumes(arguments: Sequence[str] | None) -> bool:
-    """Whether the command that was given goes on where it stopped."""
-    given = sys.argv[1:] if arguments is None else arguments
-    return bool(given) and given[0] in RESUMABLE
+    """Whether the command, given again, goes on where it stopped; `arguments` None: those of the process."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return bool(words) and words[0] in RESUMABLE
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -62,7 +62,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         sys.stderr.write(f"deepsimbad-client: cancelled{GOES_ON if resumes(arguments) else ''}\n")
         return CANCELLED
-    except BrokenPipeError:  # whoever read our output has read enough
+    except BrokenPipeError:  # the reader of the output has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     return code if isinstance(code, int) else DONE

@@ -1,4 +1,4 @@
-"""What an administrator asks for and looks at: maps to be made, jobs, domains, traverses, sessions."""
+"""An administrator's commands: make maps, and list or change jobs, domains, traverses, maps and sessions."""
 
 import sys
 from pathlib import Path
@@ -11,14 +11,14 @@ from deepsimbad_client.commands.console import (
     DownloadBar,
     JobBar,
     as_json,
-    confirmed,
+    confirm,
+    domain_filter,
     domain_option,
     domain_table,
     gate_verdict,
     job_table,
     json_flag,
     map_table,
-    of_domain,
     serving,
     session_table,
     show,
@@ -30,7 +30,7 @@ from deepsimbad_client.http.client import Client
 from deepsimbad_client.http.models import Job, MapVersion
 from deepsimbad_client.recordings.options import camera_of_option
 
-asking = click.option("--yes", is_flag=True, help="Do not ask.")
+yes_option = click.option("--yes", is_flag=True, help="Do not ask.")
 domain_argument = click.argument("domain")
 version_argument = click.argument("version", type=click.IntRange(min=1))
 
@@ -40,18 +40,18 @@ version_argument = click.argument("version", type=click.IntRange(min=1))
 @serving
 def domains(client: Client, json_output: bool) -> None:
     """List the domains of a service."""
-    listed = client.domains()
-    show_list(listed, domain_table(listed), json_output)
+    all_domains = client.domains()
+    show_list(all_domains, domain_table(all_domains), json_output)
 
 
 @click.command()
-@of_domain
+@domain_filter
 @json_flag
 @serving
 def sessions(client: Client, domain: str | None, json_output: bool) -> None:
     """List the sessions that live, newest first."""
-    listed = client.admin.sessions(domain)
-    show_list(listed, session_table(listed), json_output)
+    all_sessions = client.admin.sessions(domain)
+    show_list(all_sessions, session_table(all_sessions), json_output)
 
 
 @click.command()
@@ -60,8 +60,8 @@ def sessions(client: Client, domain: str | None, json_output: bool) -> None:
 @serving
 def traverses(client: Client, domain: str, json_output: bool) -> None:
     """List the recorded drives of a domain, and which of their frames are missing."""
-    listed = client.admin.traverses(domain)
-    show_list(listed, traverse_table(domain, listed), json_output)
+    all_traverses = client.admin.traverses(domain)
+    show_list(all_traverses, traverse_table(domain, all_traverses), json_output)
 
 
 @click.command()
@@ -70,11 +70,11 @@ def traverses(client: Client, domain: str, json_output: bool) -> None:
 @serving
 def maps(client: Client, domain: str, json_output: bool) -> None:
     """List the versions of a domain's map: which serves, and how each compared with the one before it."""
-    listed = client.admin.maps(domain)
-    show_list(listed, map_table(domain, listed), json_output)
-    for version in () if json_output else listed:
-        if why := gate_verdict(version.check):
-            click.echo(f"map {version.version}: {why}")
+    versions = client.admin.maps(domain)
+    show_list(versions, map_table(domain, versions), json_output)
+    for version in () if json_output else versions:
+        if reason := gate_verdict(version.check):
+            click.echo(f"map {version.version}: {reason}")
 
 
 @click.command()
@@ -118,16 +118,16 @@ def download(client: Client, domain: str, version: int, file: Path, force: bool,
     if file.exists() and not force:
         raise click.UsageError(f"{file} is there already: give --force to replace it")
     with DownloadBar(f"map {version} of {domain}") as bar:
-        saved = client.admin.download_map(domain, version, file, on_progress=bar)
+        map_file = client.admin.download_map(domain, version, file, on_progress=bar)
     if json_output:
-        click.echo(as_json({"path": str(saved.path), "sha256": saved.sha256, "file_bytes": saved.file_bytes}))
+        click.echo(as_json({"path": str(map_file.path), "sha256": map_file.sha256, "file_bytes": map_file.file_bytes}))
     else:
-        click.echo(f"{saved.path}: {saved.file_bytes} bytes, sha256 {saved.sha256}")
+        click.echo(f"{map_file.path}: {map_file.file_bytes} bytes, sha256 {map_file.sha256}")
 
 
 @click.command("delete-domain")
 @domain_argument
-@asking
+@yes_option
 @json_flag
 @serving
 def delete_domain(client: Client, domain: str, yes: bool, json_output: bool) -> None:
@@ -144,7 +144,7 @@ def delete_domain(client: Client, domain: str, yes: bool, json_output: bool) -> 
 @click.command("delete-traverse")
 @domain_argument
 @click.argument("traverse")
-@asking
+@yes_option
 @json_flag
 @serving
 def delete_traverse(client: Client, domain: str, traverse: str, yes: bool, json_output: bool) -> None:
@@ -159,7 +159,7 @@ def delete_traverse(client: Client, domain: str, traverse: str, yes: bool, json_
 @click.command("delete-map")
 @domain_argument
 @version_argument
-@asking
+@yes_option
 @json_flag
 @serving
 def delete_map(client: Client, domain: str, version: int, yes: bool, json_output: bool) -> None:
@@ -172,7 +172,7 @@ def delete_map(client: Client, domain: str, version: int, yes: bool, json_output
 
 @click.command("delete-session")
 @click.argument("session_id")
-@asking
+@yes_option
 @json_flag
 @serving
 def delete_session(client: Client, session_id: str, yes: bool, json_output: bool) -> None:
@@ -185,7 +185,7 @@ def delete_session(client: Client, session_id: str, yes: bool, json_output: bool
 
 
 def _ask(question: str) -> None:
-    """Go on if a person says yes; where there is nobody to ask, say how to do without."""
+    """Ask a person, and abort unless the answer is yes; raises UsageError where there is no terminal to ask on."""
     if not sys.stdin.isatty():
         raise click.UsageError("there is no terminal to ask on: give --yes")
     click.confirm(question, default=False, abort=True, err=True)
@@ -199,7 +199,7 @@ def _show_active(domain: str, version: MapVersion, json_output: bool) -> None:
 
 
 def _show_deleted(json_output: bool, **names: str | int) -> None:
-    """A script is told what is gone; a person who was asked knows."""
+    """Print the deleted names as JSON for a script; print nothing for a person."""
     if json_output:
         click.echo(as_json({**names, "deleted": True}))
 
@@ -269,7 +269,7 @@ def remap(client: Client, domain: str, wait: bool, json_output: bool, **options:
 
 @click.command()
 @click.argument("job_id", required=False)
-@of_domain
+@domain_filter
 @click.option("--last", type=click.IntRange(min=1), metavar="N", help="Only the newest N.")
 @click.option("--follow", is_flag=True, help="Follow JOB_ID to its end.")
 @click.option("--cancel", is_flag=True, help="Cancel JOB_ID.")
@@ -288,16 +288,16 @@ def jobs(
     if job_id is None:
         if follow or cancel:
             raise click.UsageError("--follow and --cancel need a JOB_ID")
-        listed = client.admin.jobs(domain)[:last]
-        show_list(listed, job_table(listed), json_output)
+        newest_jobs = client.admin.jobs(domain)[:last]
+        show_list(newest_jobs, job_table(newest_jobs), json_output)
         return
     if cancel:
         client.admin.cancel_job(job_id)
     job = client.admin.job(job_id)
     if cancel:
-        come_to = f"had ended as {job.state} before it could be" if job.ended else "is being"
-        come_to = "is" if job.state == "cancelled" else come_to
-        REMARKS.print(f"job {job.job_id} {come_to} cancelled", soft_wrap=True)
+        outcome = f"had ended as {job.state} before it could be" if job.ended else "is being"
+        outcome = "is" if job.state == "cancelled" else outcome
+        REMARKS.print(f"job {job.job_id} {outcome} cancelled", soft_wrap=True)
     _show_job(_follow(client, job) if follow and not job.ended else job, json_output)
 
 
@@ -309,12 +309,12 @@ def _follow(client: Client, job: Job) -> Job:
             bar(job)
             return follow_job(client, job.job_id, bar, on_silence=bar.silent)
     except KeyboardInterrupt:
-        if confirmed(f"Cancel job {job.job_id} on the server too?"):
+        if confirm(f"Cancel job {job.job_id} on the server too?"):
             client.admin.cancel_job(job.job_id)
             REMARKS.print(f"job {job.job_id} is being cancelled")
         else:
-            later = f"deepsimbad-client jobs {job.job_id} --follow"
-            REMARKS.print(f"job {job.job_id} goes on; see it with: {later}", soft_wrap=True)
+            command = f"deepsimbad-client jobs {job.job_id} --follow"
+            REMARKS.print(f"job {job.job_id} goes on; see it with: {command}", soft_wrap=True)
         raise
 
 
@@ -332,15 +332,15 @@ def _show_job(job: Job, json_output: bool) -> None:
         REMARKS.print(f"map {version}: {metrics['n_map_images']} images, {metrics['n_landmarks']} landmarks")
     for warning in job.warnings:
         REMARKS.print(f"warning: {warning}", soft_wrap=True)
-    why = gate_verdict(job.check)
+    reason = gate_verdict(job.check)
     if not result.get("active", True):
-        click.echo(f"map {version} was sealed but not activated{f': {why}' if why else ''}")
+        click.echo(f"map {version} was sealed but not activated{f': {reason}' if reason else ''}")
         click.echo(f"to serve it all the same: deepsimbad-client activate {job.domain} {version}")
-    elif why:
-        click.echo(f"map {version}: {why}")
+    elif reason:
+        click.echo(f"map {version}: {reason}")
     if fused := metrics.get("fused"):
-        told = "fused into the places seen again" if fused.get("accepted") else f"not fused: {fused.get('why')}"
-        REMARKS.print(f"map {version}: the drive is {told}; {fused.get('n_new_images')} new images", soft_wrap=True)
+        outcome = "fused into the places seen again" if fused.get("accepted") else f"not fused: {fused.get('why')}"
+        REMARKS.print(f"map {version}: the drive is {outcome}; {fused.get('n_new_images')} new images", soft_wrap=True)
     season = job.second_season
     if season.get("n_pairs") and not season.get("accepted"):  # their positions are comparable
         REMARKS.print(f"map {version} learnt nothing of a second season: {season.get('why')}", soft_wrap=True)

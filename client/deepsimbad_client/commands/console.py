@@ -1,4 +1,4 @@
-"""What the commands share: options, and how they show things; progress goes to standard error, times are UTC."""
+"""Options, progress bars and tables of the commands; progress goes to standard error, times are UTC."""
 
 import json
 import logging
@@ -32,14 +32,14 @@ from deepsimbad_client.replay.passive import Step
 from deepsimbad_client.tables import print_whole
 
 REMARKS = Console(stderr=True, highlight=False, markup=False)
-"""Progress and remarks; names may hold brackets, so nothing is read as markup."""
+"""The console of progress and remarks; names may hold brackets, so nothing is read as markup."""
 _GAPS_SHOWN = 8
 
 Command = Callable[..., None]
 
 
 def serving(command: Command) -> Command:
-    """Options of every command that talks to a service, and the `client` made of them."""
+    """Add the options of commands that talk to a service; the command gets the `client` made of them."""
 
     @click.option(
         "--server",
@@ -61,7 +61,7 @@ def serving(command: Command) -> Command:
     return connected
 
 
-at_once = click.option(
+concurrency_option = click.option(
     "--concurrency",
     type=click.IntRange(1, 64),
     default=CONCURRENCY,
@@ -70,7 +70,7 @@ at_once = click.option(
 )
 json_flag = click.option("--json", "json_output", is_flag=True, help="Print one JSON document.")
 domain_option = click.option("--domain", required=True, metavar="NAME", help="Of the route.")
-of_domain = click.option("--domain", metavar="NAME", help="Only this domain's.")
+domain_filter = click.option("--domain", metavar="NAME", help="Only this domain's.")
 
 
 def show(table: Table) -> None:
@@ -82,7 +82,7 @@ class Remarks(logging.Handler):
     """Shows log records to a person, above the progress bar if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Show one."""
+        """Show one record."""
         REMARKS.print(record.getMessage())
 
 
@@ -96,7 +96,7 @@ def show_waits() -> None:
 
 
 def as_json(document: Any) -> str:
-    """One document for a script."""
+    """A document as JSON text for a script."""
     return json.dumps(document, indent=2, allow_nan=False)
 
 
@@ -121,15 +121,15 @@ class Bar(Progress):
 
 
 class FrameBar(Bar):
-    """Frames made or read."""
+    """A bar of frames made or read."""
 
     def __call__(self, n_done: int, n_frames: int) -> None:
-        """Show how many there are."""
+        """Show how many frames are done."""
         self.update(self._bar, completed=n_done, total=n_frames)
 
 
 class UploadBar(Bar):
-    """Frames sent."""
+    """A bar of frames sent."""
 
     def __call__(self, progress: UploadReport) -> None:
         """Show how far an upload is."""
@@ -138,7 +138,7 @@ class UploadBar(Bar):
 
 
 class JobBar(Bar):
-    """A job's stages, and the time left as the service knows it: it knows what is still to come."""
+    """A bar of a job's stages, with the service's own estimate of the time left."""
 
     def __init__(self, label: str) -> None:
         super().__init__(label, 1.0, counted=False, left=TextColumn("{task.fields[left]}", style="progress.remaining"))
@@ -146,7 +146,7 @@ class JobBar(Bar):
     def __call__(self, job: Job) -> None:
         """Show how far a job is; one whose service was restarted waits in the queue again."""
         stage = "waiting for its turn" if job.state == "queued" else job.stage_name
-        self.update(self._bar, completed=job.progress, note=stage, left=lasting(job.eta_s))
+        self.update(self._bar, completed=job.progress, note=stage, left=duration_text(job.eta_s))
 
     def silent(self, seconds: float) -> None:
         """Show that nothing has been heard for a while."""
@@ -154,7 +154,7 @@ class JobBar(Bar):
 
 
 class DownloadBar(Bar):
-    """Bytes that are there."""
+    """A bar of bytes fetched."""
 
     def __init__(self, label: str) -> None:
         super().__init__(label, None, counted=False)
@@ -165,7 +165,7 @@ class DownloadBar(Bar):
 
 
 class ReplayBar(Bar):
-    """Queries asked, and the averaged normalised rank so far."""
+    """A bar of queries sent, with the averaged normalised rank so far."""
 
     def __init__(self, label: str, total: int) -> None:
         super().__init__(label, total)
@@ -182,7 +182,7 @@ class ReplayBar(Bar):
 
 
 class EpisodeBar(Bar):
-    """Episodes driven, and every planner's averaged normalised rank so far."""
+    """A bar of episodes driven, with every planner's averaged normalised rank so far."""
 
     def __init__(self, label: str, total: int) -> None:
         super().__init__(label, total)
@@ -198,19 +198,19 @@ class EpisodeBar(Bar):
 
 
 def domain_table(domains: Sequence[Domain]) -> Table:
-    """Domains and their active maps."""
+    """A table of domains and their active maps."""
 
     def row(domain: Domain) -> tuple[str, ...]:
         evaluator = domain.evaluator
         kind = evaluator.get("kind", "") if isinstance(evaluator, dict) else evaluator
         return (
             domain.name,
-            _shown(domain.map_version) + (f" {domain.map_problem}" if domain.map_problem else ""),
-            _shown(domain.n_map_images),
-            _shown(domain.route_length_m, ".0f"),
-            _shown(domain.n_landmarks),
-            _shown(domain.list_length),
-            _shown(domain.index_bits_per_map_image, ".1f"),
+            _format(domain.map_version) + (f" {domain.map_problem}" if domain.map_problem else ""),
+            _format(domain.n_map_images),
+            _format(domain.route_length_m, ".0f"),
+            _format(domain.n_landmarks),
+            _format(domain.list_length),
+            _format(domain.index_bits_per_map_image, ".1f"),
             str(kind or ""),
         )
 
@@ -219,11 +219,11 @@ def domain_table(domains: Sequence[Domain]) -> Table:
 
 
 def job_table(jobs: Sequence[Job]) -> Table:
-    """Jobs and how far they are."""
+    """A table of jobs and how far they are."""
     rows = (
         (
             *(job.job_id, job.domain, job.state, _minute(job.created_at), _minute(job.finished_at)),
-            *("-" if job.ended else lasting(job.eta_s), _outcome(job)),
+            *("-" if job.ended else duration_text(job.eta_s), _outcome(job)),
         )
         for job in jobs
     )
@@ -231,13 +231,13 @@ def job_table(jobs: Sequence[Job]) -> Table:
 
 
 def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
-    """A domain's history of maps: how each compares with the one that was active when it was made."""
+    """A table of a domain's maps, and how each compares with the one that was active when it was made."""
     rows = (
         (
             str(version.version),
             version.state or "",
-            _shown(version.check.get("anr"), ".2f"),
-            _shown(version.check.get("anr_active"), ".2f"),
+            _format(version.check.get("anr"), ".2f"),
+            _format(version.check.get("anr_active"), ".2f"),
             _checked_on(version.check) if version.check else "-",
             _gate(version.check),
             "removed" if version.removed_at else _size(version.file_bytes),
@@ -252,7 +252,7 @@ def map_table(domain: str, maps: Sequence[MapVersion]) -> Table:
 
 
 def session_table(sessions: Sequence[ListedSession]) -> Table:
-    """Living sessions."""
+    """A table of living sessions."""
     rows = (
         (
             *(session.session_id, session.domain, str(session.map_version), str(session.n_observations)),
@@ -264,23 +264,23 @@ def session_table(sessions: Sequence[ListedSession]) -> Table:
 
 
 def traverse_table(domain: str, traverses: Sequence[Traverse]) -> Table:
-    """A domain's recorded drives and what of them is missing."""
+    """A table of a domain's recorded drives and their missing frames."""
 
     def row(traverse: Traverse) -> tuple[str, ...]:
         gaps = [f"{first}" if first == last else f"{first}-{last}" for first, last in traverse.missing]
-        shown = ", ".join(gaps[:_GAPS_SHOWN]) + (", ..." if len(gaps) > _GAPS_SHOWN else "")
-        return traverse.name, str(traverse.n_frames), shown or "-"
+        gap_text = ", ".join(gaps[:_GAPS_SHOWN]) + (", ..." if len(gaps) > _GAPS_SHOWN else "")
+        return traverse.name, str(traverse.n_frames), gap_text or "-"
 
     return _table(f"traverses of {domain}", "traverse*~, frames>, missing~", map(row, traverses))
 
 
 def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
-    """Where images probably were taken."""
+    """A table of the places where images probably were taken."""
     knows_plane = any(answer.belief.top[0].x_m is not None for _, answer in answers)
 
     def row(name: str, answer: Localization) -> tuple[str, ...]:
         top, (low, high) = answer.belief.top[0], answer.belief.credible_95_m
-        plane = (_shown(top.x_m, ".1f"), _shown(top.y_m, ".1f")) if knows_plane else ()
+        plane = (_format(top.x_m, ".1f"), _format(top.y_m, ".1f")) if knows_plane else ()
         return name, top.frame or "-", f"{answer.belief.mode_m:.1f}", f"{low:.1f} .. {high:.1f}", *plane
 
     headings = "image*~, most like~, likeliest [m]>!, 95 % within [m]>!" + (", x [m]>!, y [m]>!" if knows_plane else "")
@@ -288,24 +288,24 @@ def place_table(answers: Sequence[tuple[str, Localization]]) -> Table:
 
 
 def whereabouts_table(answers: Sequence[tuple[str, Whereabouts]]) -> Table:
-    """On which domains images probably were taken, and where there."""
+    """A table of the domains where images probably were taken, and the places on them."""
     rows = []
     for name, answer in answers:
-        for each in answer.domains:
-            belief, chance = each.belief, f"{100 * each.probability:.1f}"
-            rows.append((name, each.domain, chance, belief.top[0].frame or "-", f"{belief.mode_m:.1f}"))
+        for likely_domain in answer.domains:
+            belief, chance = likely_domain.belief, f"{100 * likely_domain.probability:.1f}"
+            rows.append((name, likely_domain.domain, chance, belief.top[0].frame or "-", f"{belief.mode_m:.1f}"))
         rows.append((name, "elsewhere", f"{100 * answer.elsewhere:.1f}", "", ""))
     headings = "image*~, domain~, probability [%]>!, most like~, likeliest there [m]>!"
     return _table("places", headings, rows)
 
 
 def gate_verdict(check: Mapping[str, Any]) -> str:
-    """Why a gate was lost, or could not be held, in one sentence; "" where there was none or nothing to say."""
+    """Why a map lost its gate, or none could be held, in one sentence; "" where there was no gate or no reason."""
     return str(check.get("why") or "") if check.get("gate_margin") is not None else ""
 
 
-def lasting(seconds: float | None) -> str:
-    """A duration as H:MM:SS; "-" where it is not known."""
+def duration_text(seconds: float | None) -> str:
+    """A duration as H:MM:SS; "-" where unknown."""
     return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
@@ -330,18 +330,18 @@ def _outcome(job: Job) -> str:
         return "waiting for its turn" if job.state == "queued" else f"{job.stage_name}, {100 * job.progress:.0f} %"
     if job.error_text or not job.result:
         return job.error_text
-    outcome = f"map {job.result.get('map_version')}{_compared(job.check)}"
+    outcome = f"map {job.result.get('map_version')}{_check_text(job.check)}"
     if job.result.get("active", True):
         return outcome
     return f"{outcome}, sealed but not activated{': its gate was lost' if job.check.get('passed') is False else ''}"
 
 
-def _compared(check: Mapping[str, Any]) -> str:
-    """Both figures of a check, and on what they were taken; "" where there are not two."""
+def _check_text(check: Mapping[str, Any]) -> str:
+    """Both figures of a check, and the drive they were measured on; "" where one is missing."""
     if check.get("anr") is None or check.get("anr_active") is None:
         return ""
-    ours, theirs = _shown(check["anr"], ".2f"), _shown(check["anr_active"], ".2f")
-    return f" (ANR {ours} % on {_checked_on(check)}; map {check.get('active_version')}: {theirs} %)"
+    new_anr, active_anr = _format(check["anr"], ".2f"), _format(check["anr_active"], ".2f")
+    return f" (ANR {new_anr} % on {_checked_on(check)}; map {check.get('active_version')}: {active_anr} %)"
 
 
 def _checked_on(check: Mapping[str, Any]) -> str:
@@ -351,10 +351,10 @@ def _checked_on(check: Mapping[str, Any]) -> str:
 def _gate(check: Mapping[str, Any]) -> str:
     if check.get("passed") is None:
         return "-"
-    return f"{'passed' if check['passed'] else 'lost'} {_shown(check.get('gate_margin'), '+g')}"
+    return f"{'passed' if check['passed'] else 'lost'} {_format(check.get('gate_margin'), '+g')}"
 
 
-def _shown(value: float | None, form: str = "") -> str:
+def _format(value: float | None, form: str = "") -> str:
     return "-" if value is None else format(value, form)
 
 
@@ -365,20 +365,20 @@ def _size(n_bytes: int | None) -> str:
 
 
 def _minute(time: str | float | None) -> str:
-    """A time as the service tells it, UTC, to the minute."""
+    """A time of the service, UTC, cut to the minute; "-" where unknown."""
     return "-" if time is None else str(time)[:16].replace("T", " ")
 
 
 def show_list(models: Sequence[BaseModel], table: Table, json_output: bool) -> None:
-    """Print a list, for a script or for a person."""
+    """Print a list, as JSON for a script or as a table for a person."""
     if json_output:
         click.echo(as_json([model.model_dump(mode="json") for model in models]))
     else:
         show(table)
 
 
-def confirmed(question: str) -> bool:
-    """Ask on a terminal; where there is none, or on Ctrl-C, the answer is no."""
+def confirm(question: str) -> bool:
+    """Ask on a terminal whether to go on; where there is none, or on Ctrl-C, the answer is no."""
     if not sys.stdin.isatty():
         return False
     try:

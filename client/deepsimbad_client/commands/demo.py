@@ -28,8 +28,8 @@ from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import Stage, active_replay
 from deepsimbad_client.replay.passive import Replay, replay
 from deepsimbad_client.replay.plots import draw_active, draw_passive
-from deepsimbad_client.replay.report import active_tables, shown_name, summarise, summarise_active, write_summary
-from deepsimbad_client.replay.watch import in_words
+from deepsimbad_client.replay.report import active_tables, planner_label, summarise, summarise_active, write_summary
+from deepsimbad_client.replay.watch import describe_step
 
 DOMAIN = "campus"
 SEASONS = ("winter", "spring", "summer")
@@ -68,8 +68,8 @@ def demo(folder: Path, frames: int, seed: int) -> None:
         table = Table("relevance", "ANR %", "R@1 %", "R@5 %", "median answer", caption="ANR: 0 is perfect, 50 chance")
         for column in table.columns[1:]:
             column.justify = "right"
-        driven = {name: _drive(client, drives[LIVE_SEASON], name, n_landmarks, folder) for name in RELEVANCES}
-        for name, (_, summary) in sorted(driven.items(), key=lambda item: item[1][1]["anr"]):
+        replays = {name: _drive(client, drives[LIVE_SEASON], name, n_landmarks, folder) for name in RELEVANCES}
+        for name, (_, summary) in sorted(replays.items(), key=lambda item: item[1][1]["anr"]):
             table.add_row(
                 f"{name} (default)" if name == RELEVANCES[-1] else name,
                 f"{summary['anr']:.2f}",
@@ -79,7 +79,7 @@ def demo(folder: Path, frames: int, seed: int) -> None:
             )
         _say(table)
         _show_one(client, drives[LIVE_SEASON])
-        shipped, _ = driven[RELEVANCES[-1]]
+        shipped, _ = replays[RELEVANCES[-1]]
         pictures = draw_passive(shipped, shipped.folder) + _drive_actively(
             client, drives[LIVE_SEASON], folder / "active"
         )
@@ -104,7 +104,7 @@ def _upload(client: Client, drives: dict[str, Recording]) -> None:
 def _drive(
     client: Client, live: Recording, relevance: str, n_landmarks: int, folder: Path
 ) -> tuple[Replay, dict[str, Any]]:
-    """Map for one relevance and replay the live drive against it; what that came to."""
+    """Map for one relevance and replay the live drive against it; returns the replay and its summary."""
     with JobBar(f"mapping for {relevance}") as bar:
         job = remap(
             client,
@@ -123,10 +123,10 @@ def _drive(
         )
         _say(f"   the map for {relevance}: {learnt}")
     with ReplayBar(f"driving by {relevance}", len(live.frames)) as bar:
-        driven = replay(client, live, DOMAIN, folder / "replays" / relevance, restart=True, on_progress=bar)
-    summary = summarise(driven)
-    write_summary(summary, driven.folder)
-    return driven, summary
+        replayed = replay(client, live, DOMAIN, folder / "replays" / relevance, restart=True, on_progress=bar)
+    summary = summarise(replayed)
+    write_summary(summary, replayed.folder)
+    return replayed, summary
 
 
 def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]:
@@ -141,10 +141,10 @@ def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]
     row, seed = stage.start(steps, _SEED, 0)
     with stage.scene.session(DEFAULT_PLANNER, seed) as session:
         for _, step in stage.play(session, row, steps):
-            _say(f"   {in_words(step)}")
+            _say(f"   {describe_step(step)}")
     _say(f"7. The same from {EPISODES} random starts, against blind moves:")
     with EpisodeBar("driving actively", len(PLANNERS) * EPISODES) as bar:
-        driven = active_replay(
+        active = active_replay(
             *(client, live, DOMAIN, folder),
             planners=PLANNERS,
             episodes=EPISODES,
@@ -153,27 +153,27 @@ def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]
             restart=True,
             on_progress=bar,
         )
-    summary = summarise_active(driven)
+    summary = summarise_active(active)
     write_summary(summary, folder)
     for table in active_tables(summary)[:2]:
         _say(table)
     _say(f"   {_verdict(summary)}")
-    return draw_active(driven, summary, folder)
+    return draw_active(active, summary, folder)
 
 
 def _verdict(summary: dict[str, Any]) -> str:
-    """Which planner did best, the default or another, and what so few episodes can tell."""
+    """Words for the planner that did best, the default or another, and for how sure so few episodes make it."""
     anr = {name: value for name, value in summary["anr"].items() if value is not None}
     if not anr:
         return "No episode could be scored."
-    ours, best = PLANNERS[0], min(anr, key=lambda name: anr[name])
+    default, best = PLANNERS[0], min(anr, key=lambda name: anr[name])
     intervals = {name: against["interval_95"] for name, against in summary["against"].items()}
     clear = [name for name, ends in intervals.items() if ends is not None and not ends[0] <= 0 <= ends[1]]
-    told = f"Lowest ANR: {shown_name(best, summary['planner_named'][best])}, {anr[best]:.2f} %."
-    if best == ours:
-        return f"{told} By these {EPISODES} starts that is more than chance over {', '.join(clear) or 'none'}."
-    sure = "and that is more than chance" if best in clear else f"which {EPISODES} starts cannot tell from chance"
-    return f"{told} The default did not win here, {sure}."
+    winner = f"Lowest ANR: {planner_label(best, summary['planner_named'][best])}, {anr[best]:.2f} %."
+    if best == default:
+        return f"{winner} By these {EPISODES} starts that is more than chance over {', '.join(clear) or 'none'}."
+    certainty = "and that is more than chance" if best in clear else f"which {EPISODES} starts cannot tell from chance"
+    return f"{winner} The default did not win here, {certainty}."
 
 
 def _show_one(client: Client, live: Recording) -> None:
@@ -190,7 +190,7 @@ def _show_one(client: Client, live: Recording) -> None:
 
 
 def main() -> None:
-    """Run the demonstration; asked to end, it takes its service with it."""
+    """Run the demonstration; when it is terminated, its service ends with it."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         demo()

@@ -1,4 +1,4 @@
-"""What is done with a recording: `upload`, `localize`, `replay` and `watch`."""
+"""The commands that use a recording: `upload`, `localize`, `replay` and `watch`."""
 
 import json
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from deepsimbad_client.commands.console import (
     ReplayBar,
     UploadBar,
     as_json,
-    at_once,
+    concurrency_option,
     domain_option,
     json_flag,
     place_table,
@@ -61,7 +61,7 @@ ENCODING_EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 @click.option(
     "--replace", is_flag=True, help="Put frames in the place of those there that differ; else they are refused."
 )
-@at_once
+@concurrency_option
 @reading
 @accounting
 @json_flag
@@ -88,12 +88,12 @@ def upload(
     Interrupted, the same command goes on where it stopped.
     """
     try:
-        there = client.domain(domain)
+        stored_domain = client.domain(domain)
     except UnknownDomainError:
-        there = None
-    closed = closed if there is None else there.closed
+        stored_domain = None
+    closed = closed if stored_domain is None else stored_domain.closed
     recording = open_recording(source, allow_missing, closed=closed, **reading)
-    if there is None:
+    if stored_domain is None:
         _make_domain(client, domain, recording, closed, evaluator, actions_m)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
         report = upload_recording(
@@ -137,10 +137,10 @@ def localize(
     if domain == "*" or "," in domain:
         _localize_anywhere(client, domain, images, shortlist, rotate, json_output)
         return
-    described = client.domain(domain)
-    shortlist = min(shortlist, described.n_map_images or shortlist)
-    looks = views(images, described.takes, described.input_size, described.grey_levels, rotate)
-    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in looks]
+    domain_answer = client.domain(domain)
+    shortlist = min(shortlist, domain_answer.n_map_images or shortlist)
+    named_views = views(images, domain_answer.takes, domain_answer.input_size, domain_answer.grey_levels, rotate)
+    answers = [(name, client.localize(domain, shortlist=shortlist, **view)) for name, view in named_views]
     if json_output:
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
     else:
@@ -151,14 +151,16 @@ def _localize_anywhere(
     client: Client, domains: str, images: Sequence[str], shortlist: int, rotate: int | None, json_output: bool
 ) -> None:
     names = None if domains == "*" else domains.split(",")
-    looks = views(images, ("image", "objects", "text"), None, None, rotate)
-    answers = [(name, client.localize_anywhere(domains=names, shortlist=shortlist, **view)) for name, view in looks]
+    named_views = views(images, ("image", "objects", "text"), None, None, rotate)
+    answers = [
+        (name, client.localize_anywhere(domains=names, shortlist=shortlist, **view)) for name, view in named_views
+    ]
     if json_output:
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
         return
     show(whereabouts_table(answers))
-    for out in {out.domain: out for _, answer in answers for out in answer.left_out}.values():
-        REMARKS.print(f"{out.domain} is left out: {out.detail}", soft_wrap=True)
+    for domain in {domain.domain: domain for _, answer in answers for domain in answer.left_out}.values():
+        REMARKS.print(f"{domain.domain} is left out: {domain.detail}", soft_wrap=True)
 
 
 def _make_domain(
@@ -208,7 +210,7 @@ def _make_domain(
 @click.option("--plots/--no-plots", default=True, show_default=True, help="Draw pictures of it.")
 @click.option("--rerun", is_flag=True, help="Show it in the Rerun viewer as it goes.")
 @click.option("--mcap", type=click.Path(dir_okay=False, path_type=Path), help="Write what Foxglove opens.")
-@at_once
+@concurrency_option
 @reading
 @accounting
 @json_flag
@@ -247,13 +249,13 @@ def replay(
     recording = open_recording(source, allow_missing, **reading)
     folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
     name = f"{recording.name} against {domain}"
-    with ExitStack() as open_ones:
-        viewers = _viewers(rerun, mcap, open_ones)
+    with ExitStack() as open_viewers:
+        viewers = _viewers(rerun, mcap, open_viewers)
         common: dict[str, Any] = {"concurrency": concurrency, "restart": restart, "viewers": viewers}
         if planners:
             episodes = EPISODES if episodes is None else episodes
             with EpisodeBar(name, len(dict.fromkeys(planners)) * episodes) as bar:
-                driven = active_replay(
+                active_result = active_replay(
                     *(client, recording, domain, folder),
                     planners=planners,
                     episodes=episodes,
@@ -262,43 +264,43 @@ def replay(
                     on_progress=bar,
                     **common,
                 )
-            summary = summarise_active(driven)
+            summary = summarise_active(active_result)
             tables = active_tables(summary)
         else:
             with ReplayBar(name, len(recording.frames)) as bar:
-                replayed = passive_replay(
+                passive_result = passive_replay(
                     *(client, recording, domain, folder),
                     tolerance_m=TOLERANCE_M if tolerance_m is None else tolerance_m,
                     allow_missing=allow_missing,
                     on_progress=bar,
                     **common,
                 )
-            summary = summarise(replayed)
+            summary = summarise(passive_result)
             tables = [table(summary)]
     write_summary(summary, folder)
     pictures: list[Path] = []
     if plots:
         from deepsimbad_client.replay.plots import draw_active, draw_passive  # noqa: PLC0415 - matplotlib takes its time
 
-        pictures = draw_active(driven, summary, folder) if planners else draw_passive(replayed, folder)
+        pictures = draw_active(active_result, summary, folder) if planners else draw_passive(passive_result, folder)
     page = write_page(folder, name, tables, pictures)
     if json_output:
         click.echo(as_json(summary))
     else:
-        for shown in tables:
-            show(shown)
-    names = recording.left_out_names if planners else replayed.left_out_names
+        for result_table in tables:
+            show(result_table)
+    names = recording.left_out_names if planners else passive_result.left_out_names
     tell_left_out(names, recording.name, verbose=verbose)
     REMARKS.print(f"results in {folder}; all on one page: {page}", soft_wrap=True)
 
 
-def _viewers(rerun: bool, mcap: Path | None, open_ones: ExitStack) -> list[Viewer]:
-    """What shows a replay; raises MissingExtraError, ReplayError (the file is there already)."""
+def _viewers(rerun: bool, mcap: Path | None, open_viewers: ExitStack) -> list[Viewer]:
+    """The viewers of a replay, entered in `open_viewers`; raises MissingExtraError, ReplayError (the file exists)."""
     viewers: list[Viewer] = []
     if rerun:
-        viewers.append(open_ones.enter_context(RerunViewer()))
+        viewers.append(open_viewers.enter_context(RerunViewer()))
     if mcap is not None:
-        viewers.append(open_ones.enter_context(McapFile(mcap)))
+        viewers.append(open_viewers.enter_context(McapFile(mcap)))
     return viewers
 
 

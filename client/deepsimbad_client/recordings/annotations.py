@@ -28,25 +28,25 @@ FORMS = {"objects": DETECTIONS, "text": CAPTIONS}
 class AnnotatedRecording(Recording):
     """A recording whose views are annotations, with their images or in their place."""
 
-    pictured: Recording
+    image_recording: Recording
     annotations: Mapping[str, Mapping[str, Any]]  # by form, by the frame's name
     with_image: bool
 
     def stamp(self, frame: Frame) -> str:
         """See `Recording.stamp`."""
         text = json.dumps([by_name.get(frame.name) for by_name in self.annotations.values()])
-        return f"{self.pictured.stamp(frame) if self.with_image else frame.name} {text}"
+        return f"{self.image_recording.stamp(frame) if self.with_image else frame.name} {text}"
 
     def shown_by(self, levels: GreyLevels | None) -> "AnnotatedRecording":
         """See `Recording.shown_by`."""
-        return dataclasses.replace(self, pictured=self.pictured.shown_by(levels))
+        return dataclasses.replace(self, image_recording=self.image_recording.shown_by(levels))
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """The body of a frame's annotations, with its image where `with_image`; raises BrokenFrameError."""
         for form, by_name in self.annotations.items():
             if frame.name not in by_name:
                 raise BrokenFrameError(f"{FORMS[form]} says nothing of {frame.name}", f"not in {FORMS[form]}")
-        picture = self.pictured.image(frame, input_size).body if self.with_image else None
+        picture = self.image_recording.image(frame, input_size).body if self.with_image else None
         body = scene_observation({form: by_name[frame.name] for form, by_name in self.annotations.items()}, picture)
         return EncodedImage(body.body, body.content_type)
 
@@ -73,7 +73,7 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
         )
     return AnnotatedRecording(
         **{field.name: getattr(recording, field.name) for field in dataclasses.fields(Recording)},
-        pictured=recording,
+        image_recording=recording,
         annotations=annotations,
         with_image="image" in takes,
     )

@@ -1,4 +1,4 @@
-"""What a replay plays on, a domain's map, a recording and the truth by core's own rules, and the folder it fills."""
+"""The scene of a replay, a domain's map, a recording and the truth by core's own rules, and the folder it fills."""
 
 import json
 import os
@@ -30,26 +30,26 @@ Record = TypeVar("Record")
 
 MASS_DIGITS = 5
 _IDENTITY_FILE = "replay.json"
-DEFAULT_PLANNER = "default"  # Asks the service for the planner that ships
+DEFAULT_PLANNER = "default"  # the service's default planner
 
 
 @dataclass(frozen=True)
-class Seen:
-    """The service's answer to one view."""
+class ViewOutcome:
+    """The service's answer to one view, and how it came about."""
 
     answer: SessionAnswer
     latency_ms: float  # from posting the view to the answer
-    forgot: bool  # the belief had no room for the move, so the session was set back to knowing nothing
+    forgot: bool  # the belief had no room for the move and was set back to knowing nothing
 
 
 class Viewer(Protocol):
-    """Shows a replay to people as it goes; one view after another, of one thread at a time."""
+    """Shows a replay to people as it goes, one view after another, from one thread at a time."""
 
     def begin(self, scene: "Scene") -> None:
-        """Show what stays: the route."""
+        """Show the route, which stays."""
 
-    def show(self, row: int, view: Mapping[str, Any], seen: Seen) -> None:
-        """Show what was seen from a frame, and what is believed after it."""
+    def show(self, row: int, view: Mapping[str, Any], outcome: ViewOutcome) -> None:
+        """Show a frame's view, and the belief after it."""
 
 
 @dataclass(frozen=True)
@@ -57,40 +57,39 @@ class Scene:
     """A recording before a domain's active map."""
 
     client: Client
-    domain: Domain  # as the service described it; it has an active map
+    domain: Domain  # with an active map
     recording: Recording
     position_m: NDArray[np.float64]  # [m] along the recording's own route
     route: Route  # the map's images
-    right: list[NDArray[np.int64]]  # for each frame the map images that are right answers
+    right_images: list[NDArray[np.int64]]  # for each frame the map images that are right answers
     viewers: Sequence[Viewer] = ()
 
     @classmethod
     def of(
         cls, client: Client, recording: Recording, domain: str, within_m: float, viewers: Sequence[Viewer] = ()
     ) -> Self:
-        """Learn what is needed of a domain, and show viewers where it leads.
+        """The scene of a recording before a domain's active map, shown to the viewers.
 
-        A right answer may be `within_m`, in the plane where both sides know x and y, else along the route.
-        Raises ReplayError: it has no active map, one that changed meanwhile, or the recording has no frame of
-        use.
+        A right answer is `within_m` of the truth, in the plane where both sides know x and y, else along the route.
+        Raises ReplayError (no active map, one that changed meanwhile, or no frame that can be used).
         """
         if not recording.frames:
             raise ReplayError(f"{recording.name} has no frames to replay")
-        described = client.domain(domain)
-        recording = as_taken(recording, described.takes).shown_by(described.grey_levels)
-        if described.map_version is None or described.n_map_images is None:
+        domain_answer = client.domain(domain)
+        recording = as_taken(recording, domain_answer.takes).shown_by(domain_answer.grey_levels)
+        if domain_answer.map_version is None or domain_answer.n_map_images is None:
             raise ReplayError(f"domain {domain} has no active map to replay against: remap it first")
         position_m = np.array([frame.position_m for frame in recording.frames], np.float64)
-        route = _map_route(client, described, recording)
-        right = right_answers(recording, route, within_m)
-        scene = cls(client, described, recording, position_m, route, right, viewers)
+        route = _map_route(client, domain_answer, recording)
+        right_images = right_answers(recording, route, within_m)
+        scene = cls(client, domain_answer, recording, position_m, route, right_images, viewers)
         for viewer in viewers:
             viewer.begin(scene)
         return scene
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What must be the same for a replay to go on."""
+        """The facts, JSON-ready, that must be the same for a replay to go on."""
         frames = self.recording.frames
         return {
             "domain": self.domain.name,
@@ -104,15 +103,15 @@ class Scene:
 
     def session(self, planner: str = DEFAULT_PLANNER, seed: int | None = None, *, keep: bool = False) -> Session:
         """Begin a session. Raises ReplayError, ApiError."""
-        wanted = None if planner == DEFAULT_PLANNER else planner
-        session = self.client.session(self.domain.name, seed=seed, planner=wanted, keep=keep)
+        planner_name = None if planner == DEFAULT_PLANNER else planner
+        session = self.client.session(self.domain.name, seed=seed, planner=planner_name, keep=keep)
         if session.map_version != self.domain.map_version:
             session.delete()
             raise changed_map(self.domain.name)
         return session
 
     def view(self, row: int) -> dict[str, Any] | str:
-        """What is seen from a frame, as arguments of `Session.observe`, or why the frame is broken."""
+        """The view of a frame as arguments of `Session.observe`, or the reason why the frame is broken."""
         try:
             return self.recording.view(row, self.domain.input_size)
         except BrokenFrameError as error:
@@ -120,18 +119,18 @@ class Scene:
 
     def look(
         self, session: Session, row: int, view: dict[str, Any], action_m: float | None, **options: Any
-    ) -> Seen | str:
-        """Tell a session of a move and the view after it; returns the answer, or why the service cannot use the view.
+    ) -> ViewOutcome | str:
+        """Send a session a move and the view after it; returns the outcome, or why the service cannot use the view.
 
-        Viewers are shown it. A belief that is wrong may leave no room for the move that was really made, and a
+        Viewers are shown the outcome. A belief that is wrong may leave no room for the move that was really made, and a
         recording may jump or go backwards; the robot then starts anew from knowing nothing. `options` are those of
         `Session.observe`.
         """
-        began, forgot = time.perf_counter(), False
+        start_s, forgot = time.perf_counter(), False
         try:
             try:
                 answer = session.observe(**view, **options, action_m=action_m)
-            except (InvalidMoveError, IdempotencyKeyReusedError):  # the key's: told before as what follows
+            except (InvalidMoveError, IdempotencyKeyReusedError):  # a reused key: an earlier run sent the view below
                 middle_m = float(np.median(self.route.position_m))
                 session.set_prior(middle_m, 100 * max(self.route.length_m, 1.0))
                 forgot = True
@@ -140,10 +139,10 @@ class Scene:
             if error.code not in UNUSABLE_IMAGE_CODES:
                 raise
             return f"refused by the service as {error.code}"
-        seen = Seen(answer, round(1000 * (time.perf_counter() - began), 3), forgot)
+        outcome = ViewOutcome(answer, round(1000 * (time.perf_counter() - start_s), 3), forgot)
         for viewer in self.viewers:
-            viewer.show(row, view, seen)
-        return seen
+            viewer.show(row, view, outcome)
+        return outcome
 
     def apart_m(self, row: int, images: NDArray[np.int64]) -> NDArray[np.float64]:
         """[k] distance from a frame to map images, as `Route.apart_m`."""
@@ -152,11 +151,11 @@ class Scene:
 
     def nearest_right(self, row: int) -> int | None:
         """The right answer nearest to a frame; None where the map does not hold its place."""
-        right = self.right[row]
-        return int(right[self.apart_m(row, right).argmin()]) if right.size else None
+        images = self.right_images[row]
+        return int(images[self.apart_m(row, images).argmin()]) if images.size else None
 
     def place(self, image: int) -> tuple[float | None, float | None]:
-        """A map image's x and y; None where unknown."""
+        """The x and y of a map image in metres; None where unknown."""
         axes = (self.route.x_m, self.route.y_m)
         x_m, y_m = (np.nan if axis is None else float(axis[image]) for axis in axes)
         return (None if np.isnan(x_m) else x_m, None if np.isnan(y_m) else y_m)
@@ -168,7 +167,7 @@ def changed_map(domain: str) -> ReplayError:
 
 
 def right_answers(recording: Recording, route: Route, within_m: float) -> list[NDArray[np.int64]]:
-    """Right answers to each frame; of frames taken backwards as well, which still look forwards."""
+    """For each frame the map images [k] that are right answers, also where the frames go backwards along the route."""
     columns = columns_of(recording.frames)
     position_m, x_m, y_m = (columns[name] for name in ("position_m", "x_m", "y_m"))
     order = np.argsort(position_m, kind="stable")
@@ -179,7 +178,7 @@ def right_answers(recording: Recording, route: Route, within_m: float) -> list[N
 
 
 def _map_route(client: Client, domain: Domain, recording: Recording) -> Route:
-    """Learn where every map image lies from one answer that lists them all."""
+    """The map's route, by one answer that lists all map images; raises ReplayError."""
     for row in range(len(recording.frames)):
         try:
             view = recording.view(row, domain.input_size)
@@ -204,11 +203,11 @@ def _map_route(client: Client, domain: Domain, recording: Recording) -> Route:
 
 
 class Journal(Generic[Record]):
-    """`replay.json` says what is replayed; a file of JSON lines holds the records, appended as they come.
+    """A replay's folder: `replay.json` holds its identity, a file of JSON lines its records, appended as they come.
 
     An earlier replay of the same `identity` goes on, unless `restart` throws it away: `document` is its identity and
-    what was noted beside it, `earlier` its records in order, each of the `kind`. Raises
-    ReplayError (the folder holds another replay, or cannot be written).
+    the facts noted beside it, `earlier` its records in order, each of the `kind`. `record_name` names a record in
+    errors. Raises ReplayError (the folder holds another replay, or cannot be written).
     """
 
     def __init__(
@@ -217,7 +216,7 @@ class Journal(Generic[Record]):
         file_name: str,
         identity: Mapping[str, Any],
         kind: TypeAdapter[Record],
-        what: str,
+        record_name: str,
         *,
         restart: bool = False,
     ) -> None:
@@ -229,7 +228,7 @@ class Journal(Generic[Record]):
             folder.mkdir(parents=True, exist_ok=True)
             if not restart and (folder / _IDENTITY_FILE).exists():
                 self.document = self._same_replay(identity)
-                self.earlier = self._records(kind, what)
+                self.earlier = self._records(kind, record_name)
             else:
                 self._file.unlink(missing_ok=True)
                 self.note()
@@ -238,14 +237,14 @@ class Journal(Generic[Record]):
             raise ReplayError(f"cannot write to {folder}: {error.strerror or error}") from error
 
     def note(self, **facts: Any) -> None:
-        """Keep facts about this replay beside its identity."""
+        """Write facts about this replay beside its identity."""
         self.document |= facts
-        written = self.folder / f"{_IDENTITY_FILE}.tmp"
-        written.write_text(json.dumps(self.document, indent=2) + "\n")
-        written.replace(self.folder / _IDENTITY_FILE)
+        part = self.folder / f"{_IDENTITY_FILE}.tmp"
+        part.write_text(json.dumps(self.document, indent=2) + "\n")
+        part.replace(self.folder / _IDENTITY_FILE)
 
     def append(self, document: object) -> None:
-        """Write a record down; it is in the hands of the operating system when this returns."""
+        """Write a record; the operating system has it when this returns."""
         self._stream.write(json.dumps(document, allow_nan=False).encode() + b"\n")
         self._stream.flush()
 
@@ -261,29 +260,30 @@ class Journal(Generic[Record]):
         except ValueError:
             earlier = {}
         earlier = earlier if isinstance(earlier, dict) else {}
-        differing = [key for key in identity if earlier.get(key) != identity[key]]
-        if differing:
-            was = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing)
+        differing_keys = [key for key in identity if earlier.get(key) != identity[key]]
+        if differing_keys:
+            differences = ", ".join(f"{key} {earlier.get(key)!r}, now {identity[key]!r}" for key in differing_keys)
             raise ReplayError(
-                f"{self.folder} holds another replay ({was}): name another folder (--out), or --restart this one"
+                f"{self.folder} holds another replay ({differences}): "
+                "name another folder (--out), or --restart this one"
             )
         return earlier
 
-    def _records(self, kind: TypeAdapter[Record], what: str) -> list[Record]:
-        """Read the whole lines; a torn last one, left by a crash, is cut off."""
+    def _records(self, kind: TypeAdapter[Record], record_name: str) -> list[Record]:
+        """Read the records; a torn last line, left by a crash, is cut off."""
         if not self._file.exists():
             return []
         content = self._file.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) != len(content):
-            os.truncate(self._file, len(whole))
+        lines = content[: content.rfind(b"\n") + 1]
+        if len(lines) != len(content):
+            os.truncate(self._file, len(lines))
         records = []
-        for number, line in enumerate(whole.splitlines(), start=1):
+        for number, line in enumerate(lines.splitlines(), start=1):
             try:
                 records.append(kind.validate_json(line))
             except ValueError as error:
                 raise ReplayError(
-                    f"line {number} of {self._file} is no {what}: restart the replay or repair it"
+                    f"line {number} of {self._file} is no {record_name}: restart the replay or repair it"
                 ) from error
         return records
 

@@ -1,4 +1,4 @@
-"""Drive a recording against a map as one session, in order; the service ranks the truth when it is told."""
+"""Passive replays: a recording is driven against a map as one session, in order; the service ranks the truths."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,16 +15,16 @@ from deepsimbad_client.errors import GoneError, ReplayError, UnknownSessionError
 from deepsimbad_client.http.client import Client, Session
 from deepsimbad_client.http.upload import CONCURRENCY, in_order
 from deepsimbad_client.recordings import LeftOut, Recording
-from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Seen, Viewer, write_lines
+from deepsimbad_client.replay import MASS_DIGITS, Journal, Scene, Viewer, ViewOutcome, write_lines
 
 TOLERANCE_M = 2.0
-VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000  # So many views' truths are told at once, or of so many right map images
-MOST_ROWS = 400  # Of so many views the belief is kept for a picture; of a long drive every few
+VIEWS_A_TRUTH, IMAGES_A_TRUTH = 20, 50_000  # truths are sent after so many views, or so many right map images
+MOST_ROWS = 400  # views whose beliefs are kept for a picture, evenly along a long drive
 
 
 @dataclass(frozen=True)
 class Step:
-    """One frame of a passive replay and what came back; None: not known, or there is none."""
+    """One frame of a passive replay and the answer to its view; None where unknown or absent."""
 
     query: int  # place among the replayed frames, from 0
     index: int  # place in the whole recording
@@ -32,19 +32,19 @@ class Step:
     position_m: float  # along the recording's own route
     x_m: float | None
     y_m: float | None
-    broken: str | None = None  # why the frame could not be asked
+    broken: str | None = None  # the reason why the frame could not be sent
     n_true: int | None = None  # map images that are right answers
-    true_route_m: float | None = None  # where the nearest of them lies along the map's route
-    rank: float | None = None  # images that this view placed before the best right answer, ties half
-    rank_percent: float | None = None  # the same in percent of the map's images
+    true_route_m: float | None = None  # position of the nearest of them along the map's route
+    rank: float | None = None  # number of images that this view placed before the best right answer, ties half
+    rank_percent: float | None = None  # the rank in percent of the map's images
     best_map_image: int | None = None  # the most relevant one
-    best_position_m: float | None = None  # where it lies along the route
+    best_position_m: float | None = None  # its position along the route
     best_x_m: float | None = None
     best_y_m: float | None = None
     best_relevance: float | None = None
     error_m: float | None = None  # from the truth to the most relevant map image
     forgot: bool = False  # the belief had no room for the move and was set back to knowing nothing
-    latency_ms: float | None = None  # from asking to answer, preparation of the image left out
+    latency_ms: float | None = None  # from posting the view to the answer
     mass: tuple[float, ...] = ()  # the belief in equal stretches of the map's route, of every few views
 
 
@@ -54,14 +54,14 @@ _RECORDS: TypeAdapter[_Record] = TypeAdapter(_Record)
 
 @dataclass(frozen=True)
 class Replay:
-    """A replay that has come to its end."""
+    """A finished passive replay."""
 
     folder: Path  # of its files
     steps: list[Step]  # every frame, in order
     route: Route  # the map's images
-    identity: dict[str, Any]  # what was replayed against what
-    left_out_names: dict[str, list[str]]  # reason -> frames that were not asked, those that the reader left out first
-    seconds: float  # how long this run took
+    identity: dict[str, Any]  # of its scene, and its tolerance
+    left_out_names: dict[str, list[str]]  # by reason, the frames that were not sent, first those the reader left out
+    seconds: float  # that this run took
 
 
 def replay(
@@ -81,14 +81,14 @@ def replay(
 
     A right answer lies within `tolerance_m`, in the plane where both sides know x and y, else along the route.
     `folder` takes `replay.json`, `views.jsonl` (the journal) and `steps.jsonl` (all steps, at the end); interrupted
-    at any moment, the same call goes on after the last answer written down, while the session lives; `restart`
-    throws away what is there. `concurrency` images are made ready at once, and posted in order all the same.
-    `on_progress` is told of every step, those of an earlier run first, and how many there are; `viewers` of those
-    that this run asks. Raises ReplayError, ApiError, TransportError, TooManyLeftOutError (without `allow_missing`:
-    more than a twentieth of the recording is left out).
+    at any moment, the same call goes on after the last answer written, while the session lives; `restart` throws away
+    an earlier replay. `concurrency` images are made ready at once, and posted in order all the same. `on_progress` is
+    called with every step, those of an earlier run first, and the number of them; `viewers` see those that this run
+    sends. Raises ReplayError, ApiError, TransportError, TooManyLeftOutError (without `allow_missing`: more than a
+    twentieth of the recording is left out).
     """
     left_out = LeftOut(recording, allow_missing=allow_missing)
-    started = time.perf_counter()
+    start_s = time.perf_counter()
     scene = Scene.of(client, recording, domain, tolerance_m, viewers)
     identity = {"kind": "passive", **scene.identity, "tolerance_m": tolerance_m}
     with Journal(folder, "views.jsonl", identity, _RECORDS, "view", restart=restart) as journal:
@@ -100,17 +100,17 @@ def replay(
             drive.observe(row, view)
             if (reason := drive.steps[-1].broken) is not None:
                 left_out.add(reason, recording.frames[row].name)
-        drive.tell_truths()
+        drive.send_truths()
         drive.end()
     write_lines(folder / "steps.jsonl", (asdict(step) for step in drive.steps))
-    return Replay(folder, drive.steps, scene.route, identity, left_out.names, time.perf_counter() - started)
+    return Replay(folder, drive.steps, scene.route, identity, left_out.names, time.perf_counter() - start_s)
 
 
 class _Drive:
     """A passive replay under way.
 
     Attributes:
-        steps: So far, in order; the last few still without their ranks.
+        steps: The steps so far, in order; the last few still without their ranks.
     """
 
     def __init__(
@@ -124,13 +124,13 @@ class _Drive:
         ranks = [rank for record in journal.earlier if isinstance(record, list) for rank in record]
         observed = [row for row, step in enumerate(self.steps) if step.broken is None]
         self._last = observed[-1] if observed else None
-        self._n_told, self._untold = len(ranks), observed[len(ranks) :]
+        self._n_ranked, self._unranked_rows = len(ranks), observed[len(ranks) :]
         self._rank(observed, ranks)
-        self._show(self._untold[0] if self._untold else len(self.steps))
+        self._show(self._unranked_rows[0] if self._unranked_rows else len(self.steps))
 
     @cached_property
     def _session(self) -> Session:
-        """The one of an earlier run, or a new one; it outlives an interruption."""
+        """The session of an earlier run, or a new one; it outlives an interruption."""
         earlier = self._journal.document.get("session_id")
         if earlier is None:
             session = self._scene.session(keep=True)
@@ -142,33 +142,33 @@ class _Drive:
             raise ReplayError(f"this replay's session has ended meanwhile ({error}): restart it") from error
 
     def observe(self, row: int, view: dict[str, Any] | str) -> None:
-        """Post a view, or note why there is none, and write down what came back."""
+        """Post a view, or note why there is none, and write the step to the journal."""
         scene, frame = self._scene, self._scene.recording.frames[row]
         step = Step(row, frame.index, frame.name, frame.position_m, frame.x_m, frame.y_m)
         action_m = None if self._last is None else float(scene.position_m[row] - scene.position_m[self._last])
-        # Under a key of its own: one that was answered, but not written down, is told again and counts once.
-        named: dict[str, Any] = {"idempotency_key": f"view-{row}", "shortlist": 1}
-        seen = view if isinstance(view, str) else scene.look(self._session, row, view, action_m, **named)
-        if isinstance(seen, str):
-            step = replace(step, broken=seen)
+        # A key for each view: one that was answered, but not written to the journal, is sent again and counts once.
+        options: dict[str, Any] = {"idempotency_key": f"view-{row}", "shortlist": 1}
+        outcome = view if isinstance(view, str) else scene.look(self._session, row, view, action_m, **options)
+        if isinstance(outcome, str):
+            step = replace(step, broken=outcome)
         else:
-            step = self._answered(step, seen)
+            step = self._step_with_answer(step, outcome)
             self._last = row
-            self._untold.append(row)
+            self._unranked_rows.append(row)
         self._journal.append(asdict(step))
         self.steps.append(step)
-        n_images = sum(scene.right[row].size for row in self._untold)
-        if len(self._untold) >= VIEWS_A_TRUTH or n_images > IMAGES_A_TRUTH:
-            self.tell_truths()
+        n_images = sum(scene.right_images[row].size for row in self._unranked_rows)
+        if len(self._unranked_rows) >= VIEWS_A_TRUTH or n_images > IMAGES_A_TRUTH:
+            self.send_truths()
 
-    def _answered(self, step: Step, seen: Seen) -> Step:
+    def _step_with_answer(self, step: Step, outcome: ViewOutcome) -> Step:
         scene, row = self._scene, step.query
-        best, nearest = seen.answer.retrieval[0], scene.nearest_right(row)
+        best, nearest = outcome.answer.retrieval[0], scene.nearest_right(row)
         x_m, y_m = scene.place(best.map_image)
-        mass = seen.answer.belief.histogram.mass if row % -(-len(scene.right) // MOST_ROWS) == 0 else ()
+        mass = outcome.answer.belief.histogram.mass if row % -(-len(scene.right_images) // MOST_ROWS) == 0 else ()
         return replace(
             step,
-            n_true=int(scene.right[row].size),
+            n_true=int(scene.right_images[row].size),
             true_route_m=None if nearest is None else float(scene.route.position_m[nearest]),
             best_map_image=best.map_image,
             best_position_m=best.route_position_m,
@@ -176,21 +176,21 @@ class _Drive:
             best_y_m=y_m,
             best_relevance=best.relevance,
             error_m=float(scene.apart_m(row, np.array([best.map_image]))[0]),
-            forgot=seen.forgot,
-            latency_ms=seen.latency_ms,
+            forgot=outcome.forgot,
+            latency_ms=outcome.latency_ms,
             mass=tuple(round(share, MASS_DIGITS) for share in mass),
         )
 
-    def tell_truths(self) -> None:
-        """Have the views ranked that are not yet, and show them."""
-        if self._untold:
-            images = [self._scene.right[row].tolist() for row in self._untold]
+    def send_truths(self) -> None:
+        """Send the truths of the views that have no ranks yet, and show these views."""
+        if self._unranked_rows:
+            images = [self._scene.right_images[row].tolist() for row in self._unranked_rows]
             unknown = [None] * len(images)  # positions are for robots' own alarm and experience
-            score = self._session.truths(unknown, true_map_images=images, first_observation=self._n_told)
+            score = self._session.truths(unknown, true_map_images=images, first_observation=self._n_ranked)
             ranks = list(score.retrieval_ranks or ())
             self._journal.append(ranks)
-            self._rank(self._untold, ranks)
-            self._n_told, self._untold = self._n_told + len(ranks), []
+            self._rank(self._unranked_rows, ranks)
+            self._n_ranked, self._unranked_rows = self._n_ranked + len(ranks), []
         self._show(len(self.steps))
 
     def _rank(self, rows: list[int], ranks: list[float | None]) -> None:
@@ -199,13 +199,13 @@ class _Drive:
             percent = None if rank is None else 100 * rank / n_images
             self.steps[row] = replace(self.steps[row], rank=rank, rank_percent=percent)
 
-    def _show(self, until: int) -> None:
+    def _show(self, end: int) -> None:
         if self._on_progress is not None:
-            for row in range(self._n_shown, until):
+            for row in range(self._n_shown, end):
                 self._on_progress(self.steps[row], row + 1)
-        self._n_shown = until
+        self._n_shown = end
 
     def end(self) -> None:
-        """End the session, if this run had one."""
+        """End the session, if this run has one."""
         if "_session" in vars(self):
             self._session.delete()

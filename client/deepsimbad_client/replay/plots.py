@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from deepsimbad_client.replay.active import ActiveReplay, Episode
 from deepsimbad_client.replay.passive import Replay, Step
-from deepsimbad_client.replay.report import shown_name
+from deepsimbad_client.replay.report import planner_label
 
 INK, QUIET, GRID = "#22303c", "#8a97a3", "#e3e8ec"
 DOT, LINE, CHANCE, TRUTH = "#7fa3cf", "#1f4e8c", "#d1495b", "#35d0ba"
 PLANNER_COLOURS = (LINE, CHANCE, "#e0a030", "#5b9a6b", "#8a5fa8", "#4aa3b5", "#a3684a", QUIET)
 EDGE = withStroke(linewidth=3, foreground=INK)
-LEAST_PERCENT = 0.01  # Ranks are drawn on a logarithmic axis; a perfect 0 stands at its foot
+LEAST_PERCENT = 0.01  # foot of the logarithmic axis of ranks, where a perfect 0 is drawn
 PERCENT_TICKS = (0.01, 0.1, 1, 10, 50, 100)
 STRIPS = 3
 VIEWS = (
@@ -40,26 +40,26 @@ def draw_passive(replay: Replay, folder: Path) -> list[Path]:
     if not scored:
         return []
     title = f"{replay.identity['recording']}  against  {replay.identity['domain']}"
-    drawn = [
+    pictures = [
         _rank_along_route(scored, title, folder / "rank_along_route.png"),
         _belief_along_drive(replay, title, folder / "belief_along_drive.png"),
     ]
     if replay.route.x_m is not None and any(step.x_m is not None for step in scored):
-        drawn.append(_route_map(replay, scored, title, folder / "route_map.png"))
-    return drawn
+        pictures.append(_route_map(replay, scored, title, folder / "route_map.png"))
+    return pictures
 
 
 def draw_active(replay: ActiveReplay, summary: Mapping[str, Any], folder: Path) -> list[Path]:
     """Draw every picture that an active replay has numbers for; returns the PNG files."""
     title = f"{replay.identity['recording']}  against  {replay.identity['domain']}"
-    drawn = [_belief_strips(replay.episodes[replay.planners[0]][:STRIPS], title, folder / "belief_by_step.png")]
+    pictures = [_belief_strips(replay.episodes[replay.planners[0]][:STRIPS], title, folder / "belief_by_step.png")]
     if any(value is not None for value in summary["anr"].values()):
-        drawn.append(_compared(summary, title, folder / "by_step.png"))
-    return drawn
+        pictures.append(_planner_curves(summary, title, folder / "by_step.png"))
+    return pictures
 
 
 def _rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
-    """The rank of the truth at every query, with a running median over it."""
+    """Draw the rank of the truth at every query, with a running median over it."""
     position_m = np.array([step.position_m for step in scored])
     percent = np.array([step.rank_percent for step in scored], np.float64)
     order = np.argsort(position_m, kind="stable")
@@ -67,7 +67,7 @@ def _rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
     axes.scatter(position_m, np.maximum(percent, LEAST_PERCENT), s=11, color=DOT, alpha=0.75, lw=0, label="query")
     window = max(5, len(scored) // 40) | 1
     ordered, half = percent[order], window // 2
-    smooth = np.array([np.median(ordered[max(0, at - half) : at + half + 1]) for at in range(len(ordered))])
+    smooth = np.array([np.median(ordered[max(0, row - half) : row + half + 1]) for row in range(len(ordered))])
     label = f"median of {window} neighbours"
     axes.plot(position_m[order], np.maximum(smooth, LEAST_PERCENT), color=LINE, lw=2, label=label)
     axes.set_yscale("log")
@@ -82,11 +82,11 @@ def _rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
     axes.set_ylabel("map images placed before the truth [%]")
     axes.margins(x=0.01)
     _legend(axes, -0.16, 4)
-    return _saved(figure, path)
+    return _save(figure, path)
 
 
 def _belief_along_drive(replay: Replay, title: str, path: Path) -> Path:
-    """What the session believed after every few views, with the truth between two lines."""
+    """Draw the session's belief after every few views, with the truth between two lines."""
     rows = [step for step in replay.steps if step.mass]
     every = max(1, rows[1].query - rows[0].query) if len(rows) > 1 else 1
     start_m, length_m = replay.route.start_m, replay.route.length_m
@@ -106,13 +106,13 @@ def _belief_along_drive(replay: Replay, title: str, path: Path) -> Path:
     axes.set_ylabel("query")
     figure.colorbar(picture, ax=axes, pad=0.02, shrink=0.85, label="belief of an equal stretch of the route")
     _legend(axes, -0.08, 1)
-    return _saved(figure, path)
+    return _save(figure, path)
 
 
 def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -> Path:
-    """The route from above: every query where it truly was, coloured by its error, joined to a far best match."""
-    placed = [step for step in scored if step.x_m is not None and step.y_m is not None]
-    x, y, error = np.array([(step.x_m, step.y_m, step.error_m) for step in placed], float).T
+    """Draw the route from above: every query at its true place, coloured by its error, joined to a far best match."""
+    placed_steps = [step for step in scored if step.x_m is not None and step.y_m is not None]
+    x, y, error = np.array([(step.x_m, step.y_m, step.error_m) for step in placed_steps], float).T
     tolerance = float(replay.identity["tolerance_m"])
     figure, axes = _figure(title, "Where the best match misses", (8.6, 7.2))
     map_x, map_y = np.asarray(replay.route.x_m), np.asarray(replay.route.y_m)
@@ -120,7 +120,7 @@ def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    far = [step for step in placed if (step.error_m or 0) > 5 * tolerance and step.best_x_m is not None]
+    far = [step for step in placed_steps if (step.error_m or 0) > 5 * tolerance and step.best_x_m is not None]
     segments = [[(step.x_m, step.y_m), (step.best_x_m, step.best_y_m)] for step in far]
     lines = LineCollection(segments, colors=CHANCE, linewidths=0.5, alpha=0.3, zorder=2)  # type: ignore[arg-type]
     axes.add_collection(lines)
@@ -133,22 +133,24 @@ def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     bar.ax.yaxis.set_minor_locator(NullLocator())
     _legend(axes, -0.08, 2)
-    return _saved(figure, path)
+    return _save(figure, path)
 
 
 def _belief_strips(episodes: Sequence[Episode], title: str, path: Path) -> Path:
-    """What the robot believes after every move, a row for each, with the truth and the next move on it."""
+    """Draw the robot's belief after every move, a row for each, with the truth and the next move."""
     figure = _blank((10.5, 0.9 + 2.9 * len(episodes)))
     panels = np.atleast_1d(np.asarray(figure.subplots(len(episodes), 1, sharex=True)))
     for axes, episode in zip(panels, episodes, strict=True):
         _strip(axes, episode)
     first = episodes[0]
-    _head(panels[0], f"{title}   planner {shown_name(first.planner, first.planner_named)}", "What the robot believes")
+    _head(
+        panels[0], f"{title}   planner {planner_label(first.planner, first.planner_named)}", "What the robot believes"
+    )
     panels[-1].set_xlabel("along the map's route [m]")
     panels[-1].plot([], [], color=TRUTH, marker="o", ms=5, mfc="none", lw=0, label="where it truly is")
     panels[-1].plot([], [], color=QUIET, marker="|", ms=9, mew=1.6, lw=0, label="likeliest place")
     _legend(panels[-1], -0.24, 2)
-    return _saved(figure, path)
+    return _save(figure, path)
 
 
 def _strip(axes: Axes, episode: Episode) -> None:
@@ -168,18 +170,18 @@ def _strip(axes: Axes, episode: Episode) -> None:
     style: dict[str, Any] = {"fontsize": 8, "color": QUIET, "va": "center", "annotation_clip": False}
     for step, middle in zip(episode.steps[:-1], middles, strict=False):
         if step.next_action_m is not None:
-            at = (1.008, 1 - (middle + 0.5) / n_rows)
-            axes.annotate(f"{step.next_action_m:+g} m", at, xycoords="axes fraction", **style)
+            xy = (1.008, 1 - (middle + 0.5) / n_rows)
+            axes.annotate(f"{step.next_action_m:+g} m", xy, xycoords="axes fraction", **style)
 
 
-def _compared(summary: Mapping[str, Any], title: str, path: Path) -> Path:
-    """Planners from move to move with their 95 % bands, a panel for each figure; the first is drawn on top."""
+def _planner_curves(summary: Mapping[str, Any], title: str, path: Path) -> Path:
+    """Draw planners from move to move with their 95 % bands, a panel for each figure; the first planner is on top."""
     figure = _blank((4.5 * len(VIEWS) + 0.3, 4.9))
     panels = list(figure.subplots(1, len(VIEWS)))
-    first, *others = summary["config"]["planners"]
+    first, *other_planners = summary["config"]["planners"]
     for axes, (name, interval, label) in zip(panels, VIEWS, strict=True):
         _quiet(axes)
-        for place, planner in [*enumerate(others, 1), (0, first)]:
+        for place, planner in [*enumerate(other_planners, 1), (0, first)]:
             row, colour = summary["by_step"][planner], PLANNER_COLOURS[place % len(PLANNER_COLOURS)]
             points = enumerate(zip(row[name], row[interval], strict=True))
             bands = [(step, mean, *(ends or (mean, mean))) for step, (mean, ends) in points if mean is not None]
@@ -188,8 +190,8 @@ def _compared(summary: Mapping[str, Any], title: str, path: Path) -> Path:
             step, mean, low, high = np.array(bands).T
             axes.fill_between(step, low, high, color=colour, alpha=0.16, lw=0)
             width, dot = (2.4, 4) if planner == first else (1.6, 3)
-            named = shown_name(planner, summary["planner_named"][planner])
-            axes.plot(step, mean, color=colour, lw=width, marker="o", ms=dot, label=named)
+            planner_name = planner_label(planner, summary["planner_named"][planner])
+            axes.plot(step, mean, color=colour, lw=width, marker="o", ms=dot, label=planner_name)
         axes.set_ylabel(label, color=INK)
         axes.set_xlabel("moves made")
         axes.set_ylim(bottom=0)
@@ -200,7 +202,7 @@ def _compared(summary: Mapping[str, Any], title: str, path: Path) -> Path:
     handles, labels = handles[-1:] + handles[:-1], labels[-1:] + labels[:-1]
     n_columns = min(6, max(1, len(labels)))
     figure.legend(handles, labels, loc="outside lower center", ncol=n_columns, frameon=False, fontsize=9)
-    return _saved(figure, path)
+    return _save(figure, path)
 
 
 def _belief_image(axes: Axes, rows: Sequence[Sequence[float]], extent: tuple[float, float, float, float]) -> Any:
@@ -232,7 +234,7 @@ def _head(axes: Axes, title: str, heading: str) -> None:
 
 
 def _quiet(axes: Axes) -> None:
-    """Take the ink out of the frame."""
+    """Style the axes with a quiet frame and a grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(QUIET)
     axes.tick_params(colors=INK, which="both", color=GRID)
@@ -245,6 +247,6 @@ def _legend(axes: Axes, below: float, n_columns: int) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, below), ncol=n_columns, frameon=False, fontsize=9)
 
 
-def _saved(figure: Figure, path: Path) -> Path:
+def _save(figure: Figure, path: Path) -> Path:
     figure.savefig(path)
     return path

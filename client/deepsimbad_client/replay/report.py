@@ -1,4 +1,4 @@
-"""What replays came to: figures, the file they go into, tables for people, and one page of all."""
+"""Reports of replays: figures, the file that holds them, tables for people, and one page of all."""
 
 import base64
 import json
@@ -26,16 +26,16 @@ Reals = NDArray[np.float64]
 
 
 def summarise(replay: Replay) -> dict[str, Any]:
-    """Figures of a passive replay, flat and JSON-ready; those that nothing was counted for are None.
+    """Figures of a passive replay, flat and JSON-ready; a figure without a query to count is None.
 
     `anr` is the averaged normalised rank in percent: 0 is perfect, 50 chance. Queries without a right answer in the
     map are left out of it and counted in `n_left_out`.
     """
-    asked = [step for step in replay.steps if step.broken is None]
-    scored = [step for step in asked if step.rank is not None]
-    errors = [step.error_m for step in scored if step.error_m is not None]
-    latencies = [step.latency_ms for step in asked if step.latency_ms is not None]
-    ranks = [step.rank for step in scored if step.rank is not None]
+    answered_steps = [step for step in replay.steps if step.broken is None]
+    scored_steps = [step for step in answered_steps if step.rank is not None]
+    errors = [step.error_m for step in scored_steps if step.error_m is not None]
+    latencies = [step.latency_ms for step in answered_steps if step.latency_ms is not None]
+    ranks = [step.rank for step in scored_steps if step.rank is not None]
 
     def share(hits: Sequence[bool]) -> float | None:
         return 100 * sum(hits) / len(hits) if hits else None
@@ -44,11 +44,13 @@ def summarise(replay: Replay) -> dict[str, Any]:
         return round(float(np.quantile(values, q)), 3) if values else None
 
     return {
-        "anr": math.fsum(step.rank_percent or 0.0 for step in scored) / len(scored) if scored else None,
+        "anr": math.fsum(step.rank_percent or 0.0 for step in scored_steps) / len(scored_steps)
+        if scored_steps
+        else None,
         "recall_at_1": share([rank < 1 for rank in ranks]),
         "recall_at_5": share([rank < 5 for rank in ranks]),
-        "n_queries": len(scored),
-        "n_left_out": len(asked) - len(scored),
+        "n_queries": len(scored_steps),
+        "n_left_out": len(answered_steps) - len(scored_steps),
         "n_broken": dict(Counter(step.broken for step in replay.steps if step.broken is not None)),
         "left_out": {reason: len(names) for reason, names in replay.left_out_names.items()},
         "n_map_images": replay.route.n_images,
@@ -78,7 +80,7 @@ def table(summary: dict[str, Any]) -> Table:
         caption="ANR: 0 is perfect, 50 is chance. One session: statistics are its own.",
     )
     tolerance = f"within {config['tolerance_m']:g} m"
-    rows.add_row("ANR", _shown(summary["anr"], ".2f", " %"), style="bold")
+    rows.add_row("ANR", _format(summary["anr"], ".2f", " %"), style="bold")
     for label, value, unit in (
         (f"R@1 {tolerance}", summary["recall_at_1"], "%"),
         (f"R@5 {tolerance}", summary["recall_at_5"], "%"),
@@ -88,7 +90,7 @@ def table(summary: dict[str, Any]) -> Table:
         ("time an answer takes, median", summary["latency_ms"]["median"], "ms"),
         ("time an answer takes, 95 %", summary["latency_ms"]["p95"], "ms"),
     ):
-        rows.add_row(label, _shown(value, ".1f", f" {unit}"))
+        rows.add_row(label, _format(value, ".1f", f" {unit}"))
     rows.add_section()
     counts = {"queries scored": summary["n_queries"], "left out: no right answer in the map": summary["n_left_out"]}
     counts |= {f"left out: {reason}": count for reason, count in summary["left_out"].items()}
@@ -105,14 +107,14 @@ class Resampling:
         share = np.full(n_episodes, 1 / n_episodes)
         self.times = rng.multinomial(n_episodes, share, size=N_RESAMPLES).astype(np.float64)
 
-    def interval(self, values: Reals, less: Reals | None = None) -> list[float] | None:
-        """95 % interval of the mean of the known values [e, ...], or of that mean less another's.
+    def interval(self, values: Reals, baseline: Reals | None = None) -> list[float] | None:
+        """The 95 % interval of the mean of `values` [e, ...], or of that mean less the `baseline`'s; None: unknown.
 
-        NaN is unknown; a resample in which nothing is known does not count.
+        NaN is unknown; a resample without a known value does not count.
         """
-        drawn = self._means(values) if less is None else self._means(values) - self._means(less)
-        drawn = drawn[np.isfinite(drawn)]
-        return [round(float(end), _DIGITS) for end in np.percentile(drawn, _TAILS)] if drawn.size else None
+        means = self._means(values) if baseline is None else self._means(values) - self._means(baseline)
+        means = means[np.isfinite(means)]
+        return [round(float(end), _DIGITS) for end in np.percentile(means, _TAILS)] if means.size else None
 
     def _means(self, values: Reals) -> Reals:
         rows = values.reshape(len(values), -1)
@@ -123,40 +125,40 @@ class Resampling:
 
 
 def figures(episodes: Sequence[Episode], name: str) -> Reals:
-    """One figure of every step: [episodes, steps + 1] float64, NaN where it is not known."""
+    """One figure of every step: [episodes, steps + 1] float64, NaN where unknown."""
     return np.array([[getattr(step, name) for step in episode.steps] for episode in episodes], np.float64)
 
 
 def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
-    """Figures of an active replay, JSON-ready; those that nothing was counted for are None.
+    """Figures of an active replay, JSON-ready; a figure without a frame to count is None.
 
-    `anr` is in percent over all frames after each action, the first view left out; `against` holds how much better
-    (negative) the first planner is than each other.
+    `anr` is in percent over all frames after each action, the first view left out; `against` holds the first planner's
+    `anr` less each other's: below 0 the first is better.
     """
-    first, *others = replay.planners
+    first, *other_planners = replay.planners
     resampling = Resampling(len(replay.episodes[first]), int(replay.identity["seed"]))
 
     def of_planners(figure: Callable[[list[Episode]], Any]) -> dict[str, Any]:
         return {name: figure(episodes) for name, episodes in replay.episodes.items()}
 
-    moved = of_planners(lambda episodes: figures(episodes, "rank_percent")[:, 1:])
+    rank_percent = of_planners(lambda episodes: figures(episodes, "rank_percent")[:, 1:])
     against = {}
-    for name in others:
-        ours, theirs = _finite(moved[first]), _finite(moved[name])
+    for name in other_planners:
+        first_ranks, other_ranks = _finite(rank_percent[first]), _finite(rank_percent[name])
         against[name] = {
-            "anr": _rounded(ours.mean() - theirs.mean()) if ours.size and theirs.size else None,
-            "interval_95": resampling.interval(moved[first], moved[name]),
+            "anr": _round(first_ranks.mean() - other_ranks.mean()) if first_ranks.size and other_ranks.size else None,
+            "interval_95": resampling.interval(rank_percent[first], rank_percent[name]),
         }
     return {
-        "anr": {name: _mean(ranks) for name, ranks in moved.items()},
-        "interval_95": {name: resampling.interval(ranks) for name, ranks in moved.items()},
+        "anr": {name: _mean(ranks) for name, ranks in rank_percent.items()},
+        "interval_95": {name: resampling.interval(ranks) for name, ranks in rank_percent.items()},
         "against": against,
         "by_step": of_planners(lambda episodes: _by_step(episodes, resampling)),
         "travelled_m": of_planners(lambda episodes: _mean(figures(episodes, "travelled_m")[:, -1])),
         "planner_named": of_planners(lambda episodes: episodes[0].planner_named),
         "n_episodes": len(replay.episodes[first]),
-        "n_frames": {name: _finite(ranks).size for name, ranks in moved.items()},
-        "n_left_out": {name: int(np.isnan(ranks).sum()) for name, ranks in moved.items()},
+        "n_frames": {name: _finite(ranks).size for name, ranks in rank_percent.items()},
+        "n_left_out": {name: int(np.isnan(ranks).sum()) for name, ranks in rank_percent.items()},
         "n_forgot": of_planners(lambda episodes: int(figures(episodes, "forgot").sum())),
         "n_map_images": replay.identity["n_map_images"],
         "latency_ms": of_planners(lambda episodes: _middle(figures(episodes, "latency_ms"))),
@@ -166,61 +168,61 @@ def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
 
 
 def active_tables(summary: dict[str, Any]) -> list[Table]:
-    """Planners against each other, and where they know to be after their last move."""
+    """Two tables: the planners compared, and how far from the truth they are after their last move."""
     config = summary["config"]
     names = config["planners"]
     first = names[0]
-    named = {name: shown_name(name, summary["planner_named"][name]) for name in names}
-    compared = _table(
+    labels = {name: planner_label(name, summary["planner_named"][name]) for name in names}
+    comparison = _table(
         f"{config['recording']} against {config['domain']}, map {config['map_version']}: "
         f"{summary['n_episodes']} episodes of {config['steps']} moves",
         "planner",
         ["ANR %", "95 %", f"{first} gains", "95 %"],
         caption="ANR after each move: 0 is perfect, 50 is chance. 95 %: over resampled starts, the same for all.",
     )
-    localized = _table(
+    localization = _table(
         f"after {config['steps']} moves: how far from the truth",
         "planner",
         ["median", "within 5 m", "within 10 m", "moved", "forgot"],
     )
     for name in names:
         against = summary["against"].get(name, {"anr": None, "interval_95": None})
-        gain = _shown(None if against["anr"] is None else -against["anr"], "z.2f")
-        compared.add_row(
-            named[name],
-            _shown(summary["anr"][name], ".2f"),
+        gain = _format(None if against["anr"] is None else -against["anr"], "z.2f")
+        comparison.add_row(
+            labels[name],
+            _format(summary["anr"][name], ".2f"),
             _ends(summary["interval_95"][name]),
             "" if name == first else gain,
             "" if name == first else _ends(against["interval_95"], -1),
         )
         last = {figure: values[-1] for figure, values in summary["by_step"][name].items()}
-        localized.add_row(
-            named[name],
-            _shown(last["median_error_m"], ".1f", " m"),
-            _shown(last["within_5_m"], ".0f", " %"),
-            _shown(last["within_10_m"], ".0f", " %"),
-            _shown(summary["travelled_m"][name], ".0f", " m"),
+        localization.add_row(
+            labels[name],
+            _format(last["median_error_m"], ".1f", " m"),
+            _format(last["within_5_m"], ".0f", " %"),
+            _format(last["within_10_m"], ".0f", " %"),
+            _format(summary["travelled_m"][name], ".0f", " m"),
             str(summary["n_forgot"][name]),
         )
-    return [compared, localized]
+    return [comparison, localization]
 
 
-def shown_name(asked: str, named: str) -> str:
-    """A planner for people: what `default` stands for is said."""
-    return f"{named} (default)" if asked == DEFAULT_PLANNER and named != DEFAULT_PLANNER else asked
+def planner_label(name: str, service_name: str) -> str:
+    """A planner's name for people: for `default` the name of the planner that the service used."""
+    return f"{service_name} (default)" if name == DEFAULT_PLANNER and service_name != DEFAULT_PLANNER else name
 
 
 def _by_step(episodes: Sequence[Episode], resampling: Resampling) -> dict[str, list[Any]]:
     error_m = figures(episodes, "error_m")
     near = {near_m: 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M}
-    banded = {"anr": figures(episodes, "rank_percent"), "error": error_m}
-    banded |= {f"within_{near_m:g}_m": share for near_m, share in near.items()}
+    figures_with_bands = {"anr": figures(episodes, "rank_percent"), "error": error_m}
+    figures_with_bands |= {f"within_{near_m:g}_m": share for near_m, share in near.items()}
     by_step: dict[str, list[Any]] = {
         "travelled_m": _means(figures(episodes, "travelled_m")),
         "median_error_m": [_middle(column) for column in error_m.T],
         "entropy_bits": _means(figures(episodes, "entropy_bits")),
     }
-    for name, values in banded.items():
+    for name, values in figures_with_bands.items():
         by_step["error_m" if name == "error" else name] = _means(values)
         by_step[f"{name}_interval_95"] = [resampling.interval(column) for column in values.T]
     return by_step
@@ -231,21 +233,22 @@ def _means(values: Reals) -> list[float | None]:
 
 
 def _mean(values: Reals) -> float | None:
-    """Of the values that are not NaN; None where all are."""
+    """The mean of the values that are not NaN; None where all are."""
     finite = _finite(values)
-    return _rounded(finite.mean()) if finite.size else None
+    return _round(finite.mean()) if finite.size else None
 
 
 def _middle(values: Reals) -> float | None:
+    """The median of the values that are not NaN; None where all are."""
     finite = _finite(values)
-    return _rounded(float(np.median(finite))) if finite.size else None
+    return _round(float(np.median(finite))) if finite.size else None
 
 
 def _finite(values: Reals) -> Reals:
     return values[np.isfinite(values)]
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return round(float(value), _DIGITS)
 
 
@@ -264,11 +267,11 @@ def _ends(interval: list[float] | None, sign: int = 1) -> str:
     return f"{low:z.2f} .. {high:z.2f}"
 
 
-def _shown(value: float | None, form: str, unit: str = "") -> str:
+def _format(value: float | None, form: str, unit: str = "") -> str:
     return "-" if value is None else format(value, form) + unit
 
 
-# One page that holds everything it shows: it can be sent on, or opened in the console.
+# The page holds everything it shows, so that it can be sent on, or opened in the console.
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -303,7 +306,7 @@ img {{ display: block; max-width: 100%; height: auto; margin: 0 auto; }}
 
 
 def write_page(folder: Path, title: str, tables: Sequence[Table], pictures: Sequence[Path]) -> Path:
-    """Write `index.html`: the tables as the terminal shows them, and PNG files."""
+    """Write `index.html` with the tables and the PNG files within it; returns its path."""
     parts = [*map(_section, tables), *map(_picture, pictures)]
     path = folder / "index.html"
     path.write_text(_PAGE.format(title=escape(title), parts="\n".join(parts)), encoding="utf-8")
