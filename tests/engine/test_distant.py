@@ -82,7 +82,8 @@ def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(encoder, wo
     assert isinstance(view, EncodedImage)
     np.testing.assert_array_equal(view.values, expected[1])
     np.testing.assert_array_equal(distant.encode(scenes), expected)
-    np.testing.assert_array_equal(distant.dissimilarities(distant.compared(expected, model), model), dissimilarities)
+    vectors = distant.comparison_vectors(expected, model)
+    np.testing.assert_array_equal(distant.dissimilarities(vectors, model), dissimilarities)
 
 
 @pytest.mark.parametrize(

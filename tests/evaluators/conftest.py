@@ -20,8 +20,8 @@ def picture() -> NDArray[np.uint8]:
 
 
 def _cv2_file(extension: str, parameters: list[int]) -> bytes:
-    done, body = cv2.imencode(extension, picture(), parameters)
-    assert done
+    is_encoded, body = cv2.imencode(extension, picture(), parameters)
+    assert is_encoded
     return bytes(body)
 
 

@@ -123,8 +123,8 @@ def random_network(
     if is_whitened:
         whitening = random.standard_normal((n_outputs, n_clusters * d), np.float32)
         whitening_bias = random.standard_normal(n_outputs, np.float32) * np.float32(0.2)
-    kept = (tuple(kernels), tuple(biases), np.float32(8) * centres, centres)
-    return Network(*kept, whitening, whitening_bias, cluster_major, *pixels)
+    tensors = (tuple(kernels), tuple(biases), np.float32(8) * centres, centres)
+    return Network(*tensors, whitening, whitening_bias, cluster_major, *pixels)
 
 
 def netvlad_encoding(network: Network, image: Array, dtype: Any = np.float64) -> Array:
@@ -189,15 +189,15 @@ def cell(*arrays: Array) -> Array:
 
 def torch_names(network: Network, trunk: str, pool: str, whitening: str) -> dict[str, torch.Tensor]:
     """A state dict; `{}` of `trunk` and `pool` takes the rest of the name."""
-    named: dict[str, Array] = {}
+    arrays: dict[str, Array] = {}
     for layer, kernel, bias in zip(LAYERS, network.kernels, network.biases, strict=True):
-        named[trunk.format(f"{layer}.weight")], named[trunk.format(f"{layer}.bias")] = kernel, bias
-    named[pool.format("conv.weight")] = network.assignment[:, :, None, None]
-    named[pool.format("centroids")] = network.centres
+        arrays[trunk.format(f"{layer}.weight")], arrays[trunk.format(f"{layer}.bias")] = kernel, bias
+    arrays[pool.format("conv.weight")] = network.assignment[:, :, None, None]
+    arrays[pool.format("centroids")] = network.centres
     if network.whitening is not None:
-        named[f"{whitening}.weight"] = network.whitening[:, :, None, None]
-        named[f"{whitening}.bias"] = network.whitening_bias
-    return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in named.items()}
+        arrays[f"{whitening}.weight"] = network.whitening[:, :, None, None]
+        arrays[f"{whitening}.bias"] = network.whitening_bias
+    return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
 def write_pytorch_netvlad(path: Path, network: Network, parallel: str = "") -> None:
@@ -230,7 +230,7 @@ NETVLAD_WRITERS: dict[str, Callable[[Path, Network], None]] = {
 
 
 def random_squeezenet() -> dict[str, Array]:
-    """By Caffe's names, kernels [out, in, rows, columns]."""
+    """Random parameters by Caffe's names, kernels [out, in, rows, columns]."""
     random = np.random.default_rng(0)
     layers, n_inputs = [("conv1", 96, 3, 7)], 96
     for fire, (squeezed, expanded) in FIRES.items():
@@ -252,13 +252,13 @@ def write_caffe(path: Path, parameters: dict[str, Array]) -> None:
 
 
 def torchvision_names(parameters: dict[str, Array]) -> dict[str, torch.Tensor]:
-    named = {"features.0": "conv1", "classifier.1": "conv_final"}
+    origins = {"features.0": "conv1", "classifier.1": "conv_final"}
     for fire, layer in TORCHVISION_LAYERS.items():
-        for theirs, caffes in (("squeeze", "conv1x1_1"), ("expand1x1", "conv1x1_2"), ("expand3x3", "conv3x3_2")):
-            named[f"features.{layer}.{theirs}"] = f"fire{fire}/{caffes}"
+        for part, caffes in (("squeeze", "conv1x1_1"), ("expand1x1", "conv1x1_2"), ("expand3x3", "conv3x3_2")):
+            origins[f"features.{layer}.{part}"] = f"fire{fire}/{caffes}"
     return {
-        f"{theirs}.{kind}": torch.from_numpy(parameters[f"{caffes}/{short}"])
-        for theirs, caffes in named.items()
+        f"{part}.{kind}": torch.from_numpy(parameters[f"{caffes}/{short}"])
+        for part, caffes in origins.items()
         for kind, short in (("weight", "w"), ("bias", "b"))
     }
 
@@ -289,6 +289,6 @@ def squeezenet_maps(parameters: dict[str, Array], image: Array, family: str) -> 
         if fire in {2, 5, 9}:
             features = pooled(features, 3)
         squeezed = rectified(features, f"fire{fire}/conv1x1_1")
-        around = rectified(squeezed, f"fire{fire}/conv3x3_2", padding=1)
-        features = maps[fire] = np.concatenate([rectified(squeezed, f"fire{fire}/conv1x1_2"), around])
+        neighbourhood = rectified(squeezed, f"fire{fire}/conv3x3_2", padding=1)
+        features = maps[fire] = np.concatenate([rectified(squeezed, f"fire{fire}/conv1x1_2"), neighbourhood])
     return maps

@@ -47,9 +47,9 @@ def test_objects_of_an_image_are_those_that_the_detector_is_sure_of_in_shares_of
     evaluator = ObjectLayouts(f"{NAME}:tiny.pth", Compute(weights_dir=tmp_path))
     evaluator.load()
     image = np.full((60, 80, 3), 255, np.uint8)
-    found = evaluator._detector.find(image)
-    assert (found.labels, found.scores.round(3).tolist()) == (("car",), [0.9])
-    np.testing.assert_allclose(found.boxes, [[0.1, 0.1, 0.5, 1.0]])
+    objects = evaluator._detector.find(image)
+    assert (objects.labels, objects.scores.round(3).tolist()) == (("car",), [0.9])
+    np.testing.assert_allclose(objects.boxes, [[0.1, 0.1, 0.5, 1.0]])
     assert np.linalg.norm(evaluator.encode([image])) == pytest.approx(1, abs=1e-3)
 
 

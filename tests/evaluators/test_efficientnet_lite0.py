@@ -45,12 +45,12 @@ def reference(x, tensors):
     x, maps = layer(x, "_conv_stem", "_bn0", 2), []
     for repeats, _, stride, expansion in STAGES:
         for repeat in range(repeats):
-            block, before = f"_blocks.{len(maps)}", x
+            block, inputs = f"_blocks.{len(maps)}", x
             if expansion > 1:
                 x = layer(x, f"{block}._expand_conv", f"{block}._bn0")
             x = layer(x, f"{block}._depthwise_conv", f"{block}._bn1", stride if repeat == 0 else 1)
             x = layer(x, f"{block}._project_conv", f"{block}._bn2", clips=False)
-            x = x + before if repeat else x
+            x = x + inputs if repeat else x
             maps.append(x)
     return maps
 
@@ -68,8 +68,8 @@ def test_the_trunk_computes_what_was_published(tensors, size):
     fill(trunk, load_checkpoint(module.weights_file()), "weights")
     with torch.inference_mode():
         maps = trunk(torch.from_numpy(image)[None].float())
-    for ours, theirs in zip(maps, reference(image, tensors), strict=True):
-        np.testing.assert_allclose(ours[0].numpy(), theirs, atol=2e-4)
+    for actual, expected in zip(maps, reference(image, tensors), strict=True):
+        np.testing.assert_allclose(actual[0].numpy(), expected, atol=2e-4)
 
 
 def test_the_encoding_is_cells_of_two_maps_beside_the_gradient_grid(tensors):
@@ -94,29 +94,29 @@ def test_the_encoding_is_cells_of_two_maps_beside_the_gradient_grid(tensors):
 def test_all_runtimes_agree(tmp_path):
     rng = np.random.default_rng(2)
     coarse = [rng.integers(0, 256, (9, 12, 3), np.uint8) for _ in range(4)]
-    images = [cv2.resize(each, (320, 240), interpolation=cv2.INTER_CUBIC) for each in coarse]
+    images = [cv2.resize(image, (320, 240), interpolation=cv2.INTER_CUBIC) for image in coarse]
 
     def encodings(runtime):
         return make_extractor("efficientnet_lite0", Compute(runtime=runtime, weights_dir=tmp_path)).encode(images)
 
     exact = encodings(Runtime.TORCH)
-    others = {runtime: encodings(runtime) for runtime in (Runtime.TORCH_BF16, Runtime.AUTO)}
+    by_runtime = {runtime: encodings(runtime) for runtime in (Runtime.TORCH_BF16, Runtime.AUTO)}
     if has_onnxruntime():
-        others[Runtime.ONNXRUNTIME] = encodings(Runtime.ONNXRUNTIME)
-        assert np.abs(exact - others[Runtime.ONNXRUNTIME]).max() < 1e-3
+        by_runtime[Runtime.ONNXRUNTIME] = encodings(Runtime.ONNXRUNTIME)
+        assert np.abs(exact - by_runtime[Runtime.ONNXRUNTIME]).max() < 1e-3
         (exported,) = (tmp_path / "exported").iterdir()
         exported.write_bytes(exported.read_bytes()[:5000])  # a disk that was full
-        np.testing.assert_array_equal(encodings(Runtime.ONNXRUNTIME), others[Runtime.ONNXRUNTIME])
-    for runtime, other in others.items():
+        np.testing.assert_array_equal(encodings(Runtime.ONNXRUNTIME), by_runtime[Runtime.ONNXRUNTIME])
+    for runtime, other in by_runtime.items():
         assert (np.einsum("nd,nd->n", exact, other) > 1 - 1e-3).all(), runtime
 
 
 def test_a_batch_changes_nothing_that_counts():
     images = [np.random.default_rng(k).integers(0, 256, (224, 224, 3), np.uint8) for k in range(5)]
-    one = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=1)).encode(images)
-    many = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=4)).encode(images)
-    assert np.abs(one - many).max() < 1e-3
-    assert (np.einsum("nd,nd->n", one, many) > 1 - 1e-4).all(), "as near as halved precision allows"
+    single = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=1)).encode(images)
+    batched = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH, largest_batch=4)).encode(images)
+    assert np.abs(single - batched).max() < 1e-3
+    assert (np.einsum("nd,nd->n", single, batched) > 1 - 1e-4).all(), "as near as halved precision allows"
 
 
 def test_cuda_that_is_not_there_is_said(monkeypatch):

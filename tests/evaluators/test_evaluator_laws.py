@@ -19,7 +19,7 @@ from deepsimbad.evaluators.base import Fitting, Lesson
 from deepsimbad.evaluators.compute import Compute, Runtime
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import EvaluatorKind, evaluator_config, make_evaluator
-from deepsimbad.evaluators.space import seen
+from deepsimbad.evaluators.space import dissimilarities_and_vectors
 
 from .references import random_network, random_squeezenet, write_caffe, write_matlab
 from .test_onnx_file import model
@@ -144,10 +144,10 @@ def test_a_scene_is_compared_the_same_alone_and_in_company(evaluator):
 def test_the_model_survives_a_copy_of_its_arrays_and_of_the_encodings(evaluator):
     landmarks, scenes = _encodings(evaluator, 12, 1), _encodings(evaluator, 4, 2)
     model = _fitted(evaluator, landmarks)
-    before = evaluator.dissimilarities(scenes, model)
+    expected = evaluator.dissimilarities(scenes, model)
     landmarks[:] = 0  # the caller's array is the caller's
     copied = {name: array.copy() for name, array in model.items()}
-    np.testing.assert_array_equal(evaluator.dissimilarities(scenes, copied), before)
+    np.testing.assert_array_equal(evaluator.dissimilarities(scenes, copied), expected)
 
 
 def test_bad_encodings_are_refused(evaluator):
@@ -166,17 +166,18 @@ def test_bad_encodings_are_refused(evaluator):
 def test_a_composed_model_compares_unit_vectors_of_what_stands_for_encodings(evaluator):
     landmarks, scenes = _encodings(evaluator, 12, 1), _encodings(evaluator, 5, 2)
     model = dict(_fitted(evaluator, landmarks))
-    assert seen(evaluator, scenes, model)[1] is scenes, "a map that composes nothing compares encodings as they are"
-    stands_for = evaluator.compared(scenes, model)
-    assert stands_for is scenes, "of squared L2, and of what was fitted and went back to it"
-    usual = Moments.of(evaluator.compared(landmarks, model))
-    units = unit_encodings(evaluator.compared(landmarks, model), usual, None)
-    model |= {"usual": usual.mean_std(), "prototypes": units}
+    _, vectors = dissimilarities_and_vectors(evaluator, scenes, model)
+    assert vectors is scenes, "a map that composes nothing compares encodings as they are"
+    vectors = evaluator.comparison_vectors(scenes, model)
+    assert vectors is scenes, "of squared L2, and of what was fitted and went back to it"
+    moments = Moments.of(evaluator.comparison_vectors(landmarks, model))
+    units = unit_encodings(evaluator.comparison_vectors(landmarks, model), moments, None)
+    model |= {"usual": moments.mean_std(), "prototypes": units}
     assert is_composed(model)
     evaluator.check_model(model, 12)
-    expected = np.square(unit_encodings(stands_for, usual, None)[:, np.newaxis] - units).sum(axis=2)
+    expected = np.square(unit_encodings(vectors, moments, None)[:, np.newaxis] - units).sum(axis=2)
     np.testing.assert_allclose(evaluator.dissimilarities(scenes, model), expected, atol=1e-4)
-    for answer in seen(evaluator, scenes, model):
+    for answer in dissimilarities_and_vectors(evaluator, scenes, model):
         assert answer.shape[0] == 5
     with pytest.raises(InvalidEncodingError):
         evaluator.check_model({**model, "prototypes": units[:-1]}, 12)
@@ -188,12 +189,14 @@ def test_what_was_fitted_stands_beside_encodings_or_alone_in_maps_of_before(kind
     places, season, _ = _route()
     landmarks, pairs = np.arange(0, 60, 2), np.column_stack([np.arange(60)] * 2)
     model = dict(evaluator.fit(Lesson(places, landmarks, None, season, pairs)).model)
-    apart = evaluator.dissimilarities(season, model)
+    dissimilarities = evaluator.dissimilarities(season, model)
     half = {**model, f"{kind.value}_beside": np.array([0.5], np.float32)}
-    np.testing.assert_array_equal(evaluator.compared(season, half), np.hstack([season, np.float32(0.5) * apart]))
+    np.testing.assert_array_equal(
+        evaluator.comparison_vectors(season, half), np.hstack([season, np.float32(0.5) * dissimilarities])
+    )
     del model[f"{kind.value}_beside"]
     evaluator.check_model(model, 30)
-    np.testing.assert_array_equal(evaluator.compared(season, model), apart)
+    np.testing.assert_array_equal(evaluator.comparison_vectors(season, model), dissimilarities)
 
 
 @pytest.mark.parametrize("kind", FITTED)
@@ -201,9 +204,9 @@ def test_of_one_season_what_is_no_better_in_another_light_stays_at_plain_l2(kind
     evaluator = make_evaluator(evaluator_config({"kind": kind.value, "extractor": "none"}))
     rng = np.random.default_rng(0)
     places = rng.normal(size=(60, 24)).astype(np.float32)
-    moved = places[:, np.newaxis] + 0.3 * rng.normal(size=(60, 4, 24))
-    lit = places[:, np.newaxis] + 2.5 * rng.normal(size=(60, 4, 24))  # nothing to be learnt about it from what moved
-    views = np.concatenate([moved, lit], axis=1).astype(np.float32)
+    warped = places[:, np.newaxis] + 0.3 * rng.normal(size=(60, 4, 24))
+    relit = places[:, np.newaxis] + 2.5 * rng.normal(size=(60, 4, 24))  # nothing to be learnt about it from what moved
+    views = np.concatenate([warped, relit], axis=1).astype(np.float32)
     fitted = evaluator.fit(Lesson(places, np.arange(60), None, views=views, seed=1))
     (warning,) = fitted.warnings
     assert warning.startswith(f"{kind.value}_no_better: on ")
@@ -213,7 +216,7 @@ def test_of_one_season_what_is_no_better_in_another_light_stays_at_plain_l2(kind
     by_l2 = np.square(units[:, np.newaxis] - units).sum(axis=2)
     answer = evaluator.dissimilarities(places, fitted.model)
     assert (answer.argsort(axis=1)[:, 1] == by_l2.argsort(axis=1)[:, 1]).mean() > 0.95
-    assert evaluator.compared(places, fitted.model) is places
+    assert evaluator.comparison_vectors(places, fitted.model) is places
 
 
 def test_a_model_of_another_kind_or_number_is_refused_by_name(evaluator):
@@ -281,8 +284,8 @@ def test_a_fitted_model_that_is_no_better_than_plain_l2_says_so():
     fitted = evaluator.fit(Lesson(noise[0], np.arange(60), None, noise[1], pairs, seed=1))
     scores = fitted.metrics["held_out"]
     assert bool(fitted.warnings) == (scores["siamese"]["anr"] >= scores["l2"]["anr"])
-    same = np.repeat(np.eye(24, dtype=np.float32), 3, axis=0)  # nothing to win: plain L2 is perfect
-    warnings = evaluator.fit(Lesson(same, np.arange(72), None, same, np.column_stack([np.arange(72)] * 2))).warnings
+    places = np.repeat(np.eye(24, dtype=np.float32), 3, axis=0)  # nothing to win: plain L2 is perfect
+    warnings = evaluator.fit(Lesson(places, np.arange(72), None, places, np.column_stack([np.arange(72)] * 2))).warnings
     assert [warning.partition(":")[0] for warning in warnings] == ["siamese_no_better"]
 
 

@@ -20,8 +20,8 @@ from .test_onnx_file import model
 
 @pytest.fixture(params=["gradient_grid", "efficientnet_lite0"], scope="module")
 def extractor(request):
-    made = make_extractor(request.param, Compute())
-    return lambda image: made.encode([image])[0]
+    network = make_extractor(request.param, Compute())
+    return lambda image: network.encode([image])[0]
 
 
 def _scene(seed=0, width=320, height=240):
@@ -41,8 +41,8 @@ def test_a_uniform_image_has_the_one_neutral_encoding():
 def test_noise_of_a_dark_frame_is_not_a_scene(extractor):
     rng = np.random.default_rng(0)
     dark = [rng.integers(0, 3, (128, 128, 3), dtype=np.uint8) for _ in range(2)]
-    apart = np.linalg.norm(extractor(dark[0]) - extractor(dark[1]))
-    assert apart < np.linalg.norm(extractor(_scene(1)) - extractor(_scene(2)))
+    distance = np.linalg.norm(extractor(dark[0]) - extractor(dark[1]))
+    assert distance < np.linalg.norm(extractor(_scene(1)) - extractor(_scene(2)))
 
 
 def test_exposure_size_and_a_small_shift_sideways_matter_less_than_the_place(extractor):
@@ -50,9 +50,9 @@ def test_exposure_size_and_a_small_shift_sideways_matter_less_than_the_place(ext
     shift = np.float32([[1, 0, 12], [0, 1, 0]])  # 4 % of the width
     shifted = cv2.warpAffine(scene, shift, (320, 240), borderMode=cv2.BORDER_REPLICATE)
     half = cv2.resize(scene, (160, 120), interpolation=cv2.INTER_AREA)
-    apart = np.linalg.norm(extractor(scene) - extractor(other))
+    distance = np.linalg.norm(extractor(scene) - extractor(other))
     for changed, share in (((scene * 0.5 + 20).astype(np.uint8), 0.45), (shifted, 0.6), (half, 0.3)):
-        assert np.linalg.norm(extractor(scene) - extractor(changed)) < share * apart
+        assert np.linalg.norm(extractor(scene) - extractor(changed)) < share * distance
 
 
 @pytest.mark.parametrize(
@@ -86,5 +86,5 @@ def test_a_season_later_the_place_is_found(real_data, extractor):
         return evaluator.encode([decode_image((folder / f"{i:05d}.png").read_bytes(), 10**6) for i in frames])
 
     summer, winter = encoded("summer", range(1000, 1400)), encoded("winter", range(1000, 1400, 10))
-    found = evaluator.dissimilarities(winter, evaluator.fit_landmarks(summer)).argmin(axis=1)
-    assert np.mean(np.abs(found - np.arange(0, 400, 10)) <= 2) >= 0.7
+    places = evaluator.dissimilarities(winter, evaluator.fit_landmarks(summer)).argmin(axis=1)
+    assert np.mean(np.abs(places - np.arange(0, 400, 10)) <= 2) >= 0.7

@@ -21,7 +21,7 @@ N, D, SPREAD = 150, 120, 5.0
 
 
 class Half(FeatureL2):
-    """Of ready encodings of a known length."""
+    """A half that takes ready encodings of a known length."""
 
     encoding_dim = D
 
@@ -30,17 +30,19 @@ FUSED, ALONE = Fused([Half("none"), Half("none")]), FeatureL2("none")
 
 
 def season(number, *noise):
-    """A drive of 150 m: halves [N, D] of unit length, each with so much noise; a season shifts every number."""
+    """A drive of 150 m: halves [N, D] of unit length, with `noise` each; a season shifts every number."""
     halves = []
     for half, amount in enumerate(noise):
-        places, own = np.random.default_rng(half), np.random.default_rng(10 * number + half)
-        seen = places.normal(size=(N, D)) + amount * own.normal(size=(N, D)) + SPREAD * places.normal(size=D)
-        halves.append(unit(seen + own.normal(size=D)))
+        place_rng, noise_rng = np.random.default_rng(half), np.random.default_rng(10 * number + half)
+        views = (
+            place_rng.normal(size=(N, D)) + amount * noise_rng.normal(size=(N, D)) + SPREAD * place_rng.normal(size=D)
+        )
+        halves.append(unit(views + noise_rng.normal(size=D)))
     return Drive(position_m=np.arange(float(N)), encodings=np.hstack(halves))
 
 
 def halved(drive, half):
-    """The drive with that half alone, as `encode` gives it."""
+    """The drive with one half alone, as `encode` gives it."""
     encodings = np.zeros_like(drive.encodings)
     encodings[:, half * D : (half + 1) * D] = drive.encodings[:, half * D : (half + 1) * D]
     return replace(drive, encodings=encodings)
@@ -52,47 +54,49 @@ def part(drive, half):
 
 def scored(relevance, evaluator, landmarks, training, *tests):
     config = VprConfig(60, relevances=(relevance,))
-    built = build_maps(config, Fitter(evaluator), evaluator, landmarks, training)
+    maps = build_maps(config, Fitter(evaluator), evaluator, landmarks, training)
     truth = true_images_of(training.route(), training.route(), 2.0)
     progress = Progress(vpr_stages(config))
-    scores = [score_maps(config, built, ViewsOf(test, evaluator), [truth], progress, bound=False)[0] for test in tests]
-    return built[relevance], [each[relevance].anr for each in scores]
+    scores = [score_maps(config, maps, ViewsOf(test, evaluator), [truth], progress, bound=False)[0] for test in tests]
+    return maps[relevance], [anrs[relevance].anr for anrs in scores]
 
 
 @pytest.mark.parametrize("worse", [0, 1])
 def test_the_weight_is_learnt_where_the_other_drive_saw_the_same_places(worse):
     noise = [1.0, 1.0]
     noise[worse] = 2.0
-    built, _ = scored(Relevance.RRF, FUSED, season(1, *noise), season(2, *noise))
-    weight, told = float(built.map.landmark_model["fused_weight"][0]), built.fitting
+    built_map, _ = scored(Relevance.RRF, FUSED, season(1, *noise), season(2, *noise))
+    weight, fitting = float(built_map.map.landmark_model["fused_weight"][0]), built_map.fitting
     assert (weight < 0.5) == (worse == 0)
-    assert (told["weight"], told["n_shared_places"]) == (pytest.approx(weight), N)
-    assert told["anr"][f"{weight:.1f}"] == min(told["anr"].values())
-    assert told["anr"][f"{worse}.0"] < told["anr"][f"{1 - worse}.0"], "either half alone is among what was tried"
-    alone = Lesson(season(1, *noise).encodings, np.arange(N))
-    assert FUSED.fit(alone).model["fused_weight"] == 0.5
+    assert (fitting["weight"], fitting["n_shared_places"]) == (pytest.approx(weight), N)
+    assert fitting["anr"][f"{weight:.1f}"] == min(fitting["anr"].values())
+    assert fitting["anr"][f"{worse}.0"] < fitting["anr"][f"{1 - worse}.0"], "either half alone is among what was tried"
+    lesson = Lesson(season(1, *noise).encodings, np.arange(N))
+    assert FUSED.fit(lesson).model["fused_weight"] == 0.5
 
 
 def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better():
     noise = (2.0, 2.0)
     landmarks, training, test = (season(number, *noise) for number in (1, 2, 3))
-    built, (both, first, second) = scored(
+    composed, (whole_anr, first, second) = scored(
         Relevance.COMPOSED, FUSED, landmarks, training, test, halved(test, 0), halved(test, 1)
     )
-    for half, alone in enumerate((first, second)):
-        _, (own,) = scored(Relevance.COMPOSED, ALONE, *(part(drive, half) for drive in (landmarks, training, test)))
-        assert own > 1, "else there is nothing to lose"
-        assert both < alone < 1.4 * own
-    view = ViewsOf(halved(test, 0), FUSED).by(built.map.landmark_model).at(0)
-    usual = built.map.live_statistics
-    live = usual.observing(view)
-    np.testing.assert_array_equal(live.encodings.std[D:], usual.encodings.std[D:], "what was not told taught something")
-    assert (live.encodings.mean[:D] != usual.encodings.mean[:D]).all()
+    for half, half_anr in enumerate((first, second)):
+        _, (own_anr,) = scored(Relevance.COMPOSED, ALONE, *(part(drive, half) for drive in (landmarks, training, test)))
+        assert own_anr > 1, "else there is nothing to lose"
+        assert whole_anr < half_anr < 1.4 * own_anr
+    view = ViewsOf(halved(test, 0), FUSED).by(composed.map.landmark_model).at(0)
+    map_statistics = composed.map.live_statistics
+    live_statistics = map_statistics.observing(view)
+    np.testing.assert_array_equal(
+        live_statistics.encodings.std[D:], map_statistics.encodings.std[D:], "what was not told taught something"
+    )
+    assert (live_statistics.encodings.mean[:D] != map_statistics.encodings.mean[:D]).all()
 
 
 def test_what_an_encoder_broke_does_not_pass_for_a_half_that_is_missing():
-    built, _ = scored(Relevance.COMPOSED, FUSED, season(1, 1.0, 1.0), season(2, 1.0, 1.0))
-    model, broken = built.map.landmark_model, season(3, 1.0, 1.0).encodings[:2].copy()
+    composed, _ = scored(Relevance.COMPOSED, FUSED, season(1, 1.0, 1.0), season(2, 1.0, 1.0))
+    model, broken = composed.map.landmark_model, season(3, 1.0, 1.0).encodings[:2].copy()
     broken[0, D:] = np.nan
     with pytest.raises(InvalidEncodingError):
         FUSED.dissimilarities(broken, model)
@@ -101,8 +105,8 @@ def test_what_an_encoder_broke_does_not_pass_for_a_half_that_is_missing():
 
 
 def test_of_numbers_some_of_which_are_not_told_the_others_count():
-    usual = Moments.of(np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32))
-    after = usual.observing(np.array([1.0, np.nan, 2.0], np.float32))
-    whole = usual.observing(np.array([1.0, 0.0, 2.0], np.float32))
-    assert (after.mean[[0, 2]] == whole.mean[[0, 2]]).all()
-    assert (after.mean[1], after.square[1]) == (usual.mean[1], usual.square[1])
+    moments = Moments.of(np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32))
+    partial = moments.observing(np.array([1.0, np.nan, 2.0], np.float32))
+    complete = moments.observing(np.array([1.0, 0.0, 2.0], np.float32))
+    assert (partial.mean[[0, 2]] == complete.mean[[0, 2]]).all()
+    assert (partial.mean[1], partial.square[1]) == (moments.mean[1], moments.square[1])

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepsimbad.evaluators.grey_levels import holds_few_greys, levels_in, measured, shown
+from deepsimbad.evaluators.grey_levels import holds_few_greys, levels_in, measured_levels, scaled_picture
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad_client.recordings.sources import open_source
 
@@ -35,7 +35,7 @@ def filled(folder, deepen, n=6, form="png"):
     return open_source(str(folder))
 
 
-def sent(recording, number, size=None):
+def posted_picture(recording, number, size=None):
     return decode_image(recording.image(recording.frames[number], size).body, LIMIT)[..., 1]
 
 
@@ -45,7 +45,7 @@ def test_a_camera_that_fills_the_low_bits_shows_its_own_eight(tmp_path, bits, fo
     recording = filled(tmp_path / "drive", lambda grey: grey * WHOLE_DEPTHS[bits], form=form)
     assert recording.grey_levels == (0, 2 ** int(bits) - 1)
     for number in range(6):
-        np.testing.assert_array_equal(sent(recording, number), picture(number))
+        np.testing.assert_array_equal(posted_picture(recording, number), picture(number))
     assert any("shown as 8" in remark for remark in recording.remarks)
 
 
@@ -53,7 +53,7 @@ def test_a_camera_that_fills_the_low_bits_shows_its_own_eight(tmp_path, bits, fo
 def test_a_part_of_the_range_is_stretched_over_the_whole_recording(tmp_path, kind):
     recording = filled(tmp_path / "drive", STRETCHED[kind])
     for number in range(6):
-        grey = sent(recording, number).astype(float)
+        grey = posted_picture(recording, number).astype(float)
         assert np.corrcoef(grey.ravel(), picture(number).ravel())[0, 1] > 0.99
         assert 0.8 < grey.std() / picture(number).std() < 1.3
         assert (grey == 255).mean() + (grey == 0).mean() < 0.01
@@ -67,14 +67,14 @@ def test_a_lens_cap_at_either_end_tells_no_levels(tmp_path):
         cv2.imwrite(str(folder / f"{number}.png"), noise.integers(60, 70, (120, 160), np.uint16))
     recording = open_source(str(folder))
     assert recording.grey_levels == (0, 4095)
-    assert sent(recording, 0).std() < 1
-    assert sent(recording, 29).max() < 10
+    assert posted_picture(recording, 0).std() < 1
+    assert posted_picture(recording, 29).max() < 10
     assert open_source(f"{folder}#10:15").grey_levels == (0, 4095), "a slice is shown as the whole"
 
 
 def test_noise_is_not_stretched_to_a_picture():
     noise = np.random.default_rng(0).integers(200, 250, (40, 60, 3), np.uint16)
-    assert np.ptp(shown(noise, measured([noise]))) < 52
+    assert np.ptp(scaled_picture(noise, measured_levels([noise]))) < 52
 
 
 def test_images_of_eight_bits_have_no_levels(tmp_path):
@@ -82,7 +82,7 @@ def test_images_of_eight_bits_have_no_levels(tmp_path):
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture(number))
     recording = open_source(str(tmp_path))
     assert recording.grey_levels is None
-    np.testing.assert_array_equal(sent(recording, 0), picture(0))
+    np.testing.assert_array_equal(posted_picture(recording, 0), picture(0))
 
 
 def test_few_greys_are_noticed():

@@ -119,13 +119,13 @@ def test_not_an_image(body):
 
 
 def test_every_cut_is_refused(body):
-    whole = decode_image(body, LIMIT)
+    expected = decode_image(body, LIMIT)
     for cut in range(4, len(body) - 1, max(1, len(body) // 60)):
         try:
             image = decode_image(body[:cut], LIMIT)
         except InvalidImageError:
             continue
-        np.testing.assert_array_equal(image, whole)  # a cut behind the last byte that matters
+        np.testing.assert_array_equal(image, expected)  # a cut behind the last byte that matters
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
@@ -150,8 +150,8 @@ def test_the_pixel_limit_is_exact(body):
     assert caught.value.hints == {"width": 48, "height": 32, "max_pixels": 48 * 32 - 1}
 
 
-def _tiff(width: int, height: int, *more: tuple[int, int]) -> bytes:
-    entries = [(256, width), (257, height), (273, 8), (277, 1), (279, 4), *more]
+def _tiff(width: int, height: int, *further_entries: tuple[int, int]) -> bytes:
+    entries = [(256, width), (257, height), (273, 8), (277, 1), (279, 4), *further_entries]
     directory = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
     return b"II*\x00" + struct.pack("<I", 12) + bytes(4) + struct.pack("<H", len(entries)) + directory + bytes(4)
 
@@ -254,12 +254,12 @@ def test_more_pixels_than_are_kept_are_averaged_by_a_whole_factor():
     small = cv2.resize(np.random.default_rng(2).integers(0, 255, (9, 16, 3), np.uint8), (2000, 1100))
     large = np.repeat(np.repeat(small, 3, axis=0), 3, axis=1)
     body = cv2.imencode(".png", large)[1].tobytes()
-    kept = decode_image(body, 50_000_000)
+    reduced = decode_image(body, 50_000_000)
     side = 2 if large.shape[0] * large.shape[1] <= 4 * KEPT_PIXELS else 3
-    assert kept.shape == (3300 // side, 6000 // side, 3)
-    assert kept.shape[0] * kept.shape[1] <= KEPT_PIXELS < large.shape[0] * large.shape[1]
-    before, after = FeatureL2("gradient_grid").encode([large, kept])
-    assert np.square(before - after).sum() < 1e-4  # two unlike pictures are about 1 apart
+    assert reduced.shape == (3300 // side, 6000 // side, 3)
+    assert reduced.shape[0] * reduced.shape[1] <= KEPT_PIXELS < large.shape[0] * large.shape[1]
+    large_encoding, reduced_encoding = FeatureL2("gradient_grid").encode([large, reduced])
+    assert np.square(large_encoding - reduced_encoding).sum() < 1e-4  # two unlike pictures are about 1 apart
 
 
 @pytest.mark.parametrize("shape", [(2160, 3840), (3840, 2160), (8, 1_000_000)])
@@ -284,8 +284,8 @@ def _grained(random, grain, level=128, spread=50, size=(120, 160)):
 def test_one_grey_is_blank_and_so_is_noise_of_small_grain_but_not_a_faint_scene(scale):
     random = np.random.default_rng(4)
     size = (int(120 * scale), int(160 * scale))
-    for nothing in (_grained(random, 0, 250, 2, size), _grained(random, 0, 8, 3, size), _grained(random, 1, size=size)):
-        assert is_blank(nothing)
+    for blank in (_grained(random, 0, 250, 2, size), _grained(random, 0, 8, 3, size), _grained(random, 1, size=size)):
+        assert is_blank(blank)
     assert is_blank(np.full((*size, 3), 90, np.uint8))
     faint = _grained(random, 25 * scale, 20, 2, size)  # blots as large as houses, hardly lit
     assert not is_blank(np.clip(faint + random.normal(0, 1, faint.shape), 0, 255).astype(np.uint8))

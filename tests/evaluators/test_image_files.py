@@ -95,7 +95,7 @@ def test_exif_that_cannot_be_read_turns_nothing(exif):
 def test_a_cut_jpeg_that_was_closed_is_truncated_wherever_it_was_cut(kind):
     """Decoders fill the rest with grey, or give a progressive picture blurred, and only warn."""
     body = JPEGS[kind]
-    whole, n_refused = decode_image(body, LIMIT), 0
+    expected, n_refused = decode_image(body, LIMIT), 0
     scan = body.index(b"\xff\xda")
     for cut in {*range(scan + 20, len(body) - 2, max(1, len(body) // 120)), *range(len(body) - 12, len(body) - 2)}:
         try:
@@ -103,14 +103,14 @@ def test_a_cut_jpeg_that_was_closed_is_truncated_wherever_it_was_cut(kind):
         except TruncatedImageError:
             n_refused += 1
         else:  # the bytes behind the cut only fill up
-            np.testing.assert_array_equal(image, whole, err_msg=f"cut at {cut} of {len(body)}")
+            np.testing.assert_array_equal(image, expected, err_msg=f"cut at {cut} of {len(body)}")
     assert n_refused > 100
 
 
 @pytest.mark.parametrize("kind", ["progressive", "progressive grey"])
 def test_a_progressive_jpeg_that_lacks_scans_is_truncated(kind):
     body = JPEGS[kind]
-    starts = [at for at in range(len(body)) if body[at : at + 2] == b"\xff\xda"]
+    starts = [offset for offset in range(len(body)) if body[offset : offset + 2] == b"\xff\xda"]
     assert len(starts) > 4
     for start in starts[1:]:  # between scans nothing is half read, and no decoder warns
         with pytest.raises(TruncatedImageError):
@@ -132,9 +132,9 @@ def test_most_jpegs_that_are_damaged_inside_are_refused():
 @pytest.mark.parametrize("kind", JPEGS)
 def test_what_lies_behind_a_jpeg_or_fills_it_up_is_no_part_of_it(kind):
     body = JPEGS[kind]
-    whole = decode_image(body, LIMIT)
+    expected = decode_image(body, LIMIT)
     for longer in (body + FILM, body + JPEGS["grey"], body + b"\0" * 9, body[:-2] + b"\0" * 9 + b"\xff\xd9"):
-        np.testing.assert_array_equal(decode_image(longer, LIMIT), whole)
+        np.testing.assert_array_equal(decode_image(longer, LIMIT), expected)
     with pytest.raises(TruncatedImageError):
         decode_image(body[: len(body) // 2] + FILM, LIMIT)
 

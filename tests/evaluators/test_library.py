@@ -13,7 +13,7 @@ from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN
 from deepsimbad.evaluators.weights import downloads
 from deepsimbad.evaluators.weights.downloads import pull_file, unpack
 from deepsimbad.evaluators.weights.files import file_sha256
-from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known
+from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known_weights
 from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
 
 
@@ -22,10 +22,10 @@ def test_every_row_can_be_named_in_a_configuration():
     assert len(set(names)) == len(names)
     for weights in KNOWN:
         assert re.fullmatch(EXTRACTOR_PATTERN, weights.extractor), weights.name
-        assert known(weights.name) is known(weights.extractor) is weights
-    assert known("torchhub:GMBERTON/megaloc:get_trained_model") is known("megaloc")
-    assert known("torchhub:gmberton/MegaLoc:Get_trained_model") is None
-    assert known("nothing") is None
+        assert known_weights(weights.name) is known_weights(weights.extractor) is weights
+    assert known_weights("torchhub:GMBERTON/megaloc:get_trained_model") is known_weights("megaloc")
+    assert known_weights("torchhub:gmberton/MegaLoc:Get_trained_model") is None
+    assert known_weights("nothing") is None
 
 
 def test_every_row_says_what_can_be_known_of_it():
@@ -43,10 +43,10 @@ def test_every_row_says_what_can_be_known_of_it():
 
 
 def test_what_is_stated_of_our_own_extractors_is_so():
-    ours = known("efficientnet-lite0")
-    assert (ours.encoding_dim, ours.input_size) == (EfficientNetLite0.encoding_dim, EfficientNetLite0.input_size)
-    assert known("squeezenet").encoding_dim == squeezenet.ENCODING_DIM
-    assert known("squeezenet").input_size == (squeezenet.TORCHVISION.side,) * 2
+    default = known_weights("efficientnet-lite0")
+    assert (default.encoding_dim, default.input_size) == (EfficientNetLite0.encoding_dim, EfficientNetLite0.input_size)
+    assert known_weights("squeezenet").encoding_dim == squeezenet.ENCODING_DIM
+    assert known_weights("squeezenet").input_size == (squeezenet.TORCHVISION.side,) * 2
     for name, preset in (
         ("netvlad-pitts30k", netvlad.MATLAB),
         ("netvlad-tokyotm", netvlad.MATLAB),
@@ -55,7 +55,7 @@ def test_what_is_stated_of_our_own_extractors_is_so():
         ("patch-netvlad-pittsburgh-4096", netvlad.PATCH_NETVLAD),
         ("openibl", netvlad.OPENIBL),
     ):
-        assert known(name).input_size == preset.input_size, name
+        assert known_weights(name).input_size == preset.input_size, name
 
 
 def test_a_tree_is_its_paths_and_contents(tmp_path):
@@ -95,17 +95,17 @@ def test_a_file_that_lies_here_is_recorded_as_it_is(tmp_path):
 
 
 def test_a_known_file_must_have_the_digest_that_is_known_of_it(tmp_path):
-    listed = known("squeezenet")
-    (tmp_path / listed.file).write_bytes(b"another")
+    weights = known_weights("squeezenet")
+    (tmp_path / weights.file).write_bytes(b"another")
     with pytest.raises(InvalidWeightsError, match="should have b66bff10"):
-        pull_file(tmp_path, listed.extractor, lambda *_: None)
+        pull_file(tmp_path, weights.extractor, lambda *_: None)
 
 
 def test_a_file_at_no_address_is_to_be_put_there_by_hand(tmp_path):
-    with pytest.raises(MissingWeightsError) as told:
+    with pytest.raises(MissingWeightsError) as error:
         pull_file(tmp_path, "netvlad:checkpoint.pth.tar", lambda *_: None)
-    assert "https://drive.google.com" in told.value.message
-    assert str(tmp_path / "checkpoint.pth.tar") in told.value.message
+    assert "https://drive.google.com" in error.value.message
+    assert str(tmp_path / "checkpoint.pth.tar") in error.value.message
     with pytest.raises(MissingWeightsError, match="--url"):
         pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
 
@@ -118,7 +118,7 @@ def _zip(path, members):
 
 
 @pytest.mark.parametrize(
-    ("members", "told"),
+    ("members", "message"),
     [
         ({"r/hubconf.py": "", "r/../../out.py": ""}, "outside"),
         ({"r/hubconf.py": "", "/out.py": ""}, "outside"),
@@ -130,10 +130,10 @@ def _zip(path, members):
         ({"r/hubconf.py": "", **{f"r/{i}": "" for i in range(30)}}, "more than a repository holds"),
     ],
 )
-def test_archives_that_are_no_repositories_are_refused(tmp_path, monkeypatch, members, told):
+def test_archives_that_are_no_repositories_are_refused(tmp_path, monkeypatch, members, message):
     monkeypatch.setattr(downloads, "_MOST_MEMBERS", 30)
     (tmp_path / "hub").mkdir()
-    with pytest.raises(InvalidWeightsError, match=told):
+    with pytest.raises(InvalidWeightsError, match=message):
         unpack(_zip(tmp_path / "x.zip", members), tmp_path / "hub" / "to")
     assert list((tmp_path / "hub").iterdir()) == []
     assert not (tmp_path / "out.py").exists()
@@ -149,10 +149,10 @@ def test_links_in_an_archive_are_refused(tmp_path):
         unpack(tmp_path / "x.zip", tmp_path / "to")
 
 
-@pytest.mark.parametrize("kept", [0, 10, 80])
-def test_a_torn_archive_is_refused(tmp_path, kept):
+@pytest.mark.parametrize("n_bytes", [0, 10, 80])
+def test_a_torn_archive_is_refused(tmp_path, n_bytes):
     path = _zip(tmp_path / "x.zip", {"r/hubconf.py": "import torch"})
-    path.write_bytes(path.read_bytes()[:kept])
+    path.write_bytes(path.read_bytes()[:n_bytes])
     with pytest.raises(InvalidWeightsError, match="no whole archive"):
         unpack(path, tmp_path / "to")
 

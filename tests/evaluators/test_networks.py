@@ -6,7 +6,7 @@ import torch
 
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.extractors.netvlad import netvlad, read_netvlad
-from deepsimbad.evaluators.extractors.squeezenet import CELLS, ENCODING_DIM, TAKEN, read_squeezenet, squeezenet
+from deepsimbad.evaluators.extractors.squeezenet import CELLS, ENCODING_DIM, OUTPUT_FIRES, read_squeezenet, squeezenet
 from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
 from deepsimbad.evaluators.runtimes import has_onnxruntime
 
@@ -38,7 +38,7 @@ def encoded(module, image):
         return module.eval()(torch.from_numpy(image[None]))[0].numpy()
 
 
-def written(folder, family, **options):
+def write_network(folder, family, **options):
     network = random_network(family, **options)
     path = folder / f"{family}.weights"
     NETVLAD_WRITERS[family](path, network)
@@ -47,16 +47,16 @@ def written(folder, family, **options):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_netvlad_agrees_with_the_equations(tmp_path, family):
-    path, network = written(tmp_path, family)
+    path, network = write_network(tmp_path, family)
     assert read_netvlad(path).preset.family == family
     image = scene(90, 118) if family == "matlab" else scene(480, 640)
     expected = netvlad_encoding(network, image, np.float32)
-    for runtime, least in PRECISIONS:
+    for runtime, least_cosine in PRECISIONS:
         extractor = loaded(netvlad, path, runtime)
         assert extractor.input_size == (None if family == "matlab" else (640, 480))
         encodings = extractor.encode([image])
         assert encodings.shape == (1, extractor.encoding_dim)
-        assert cosine(encodings[0], expected) > least
+        assert cosine(encodings[0], expected) > least_cosine
 
 
 def test_names_of_several_devices(tmp_path):
@@ -76,7 +76,7 @@ def test_double_precision_is_brought_to_single(tmp_path):
 
 
 def test_matlabs_aspect_is_kept_and_the_longer_side_reduced_to_1024(tmp_path):
-    path, network = written(tmp_path, "matlab")
+    path, network = write_network(tmp_path, "matlab")
     extractor = loaded(netvlad, path, largest_batch=4)
     assert extractor.prepare(scene(60, 100)).shape == (60, 100, 3)
     assert extractor.prepare(scene(700, 1400)).shape == (512, 1024, 3)
@@ -88,7 +88,7 @@ def test_matlabs_aspect_is_kept_and_the_longer_side_reduced_to_1024(tmp_path):
 
 
 def test_weights_laid_out_for_the_processor_are_made_anew_after_a_cast(tmp_path):
-    path, network = written(tmp_path, "matlab")
+    path, network = write_network(tmp_path, "matlab")
     image = scene(64, 80)
     module = read_netvlad(path).module().requires_grad_(False)
     expected = netvlad_encoding(network, image)
@@ -119,7 +119,7 @@ def parameters():
 
 def squeezenet_encoding(parameters, image, family):
     maps = squeezenet_maps(parameters, image, family)
-    return unit(np.concatenate([references.grid(maps[fire], *CELLS) for fire in TAKEN]))
+    return unit(np.concatenate([references.grid(maps[fire], *CELLS) for fire in OUTPUT_FIRES]))
 
 
 @pytest.mark.parametrize("family", sorted(SQUEEZENET_WRITERS))
@@ -133,16 +133,16 @@ def test_squeezenet_agrees_with_the_papers_table(tmp_path, parameters, family):
     normalised = ((pixels - np.array(weights.preset.mean)) / np.array(weights.preset.std)).astype(np.float32)
     with torch.inference_mode():
         maps = weights.trunk(tuple(FIRES))(torch.from_numpy(normalised.transpose(2, 0, 1)[None]))
-    for ours, (fire, theirs) in zip(maps, expected.items(), strict=True):
-        assert ours[0].shape == theirs.shape, fire
-        np.testing.assert_allclose(ours[0].numpy(), theirs, rtol=1e-3, atol=1e-4 * theirs.max())
-    whole = unit(np.concatenate([references.grid(expected[fire], *CELLS) for fire in TAKEN]))
-    for runtime, least in PRECISIONS:
+    for actual, (fire, expected_map) in zip(maps, expected.items(), strict=True):
+        assert actual[0].shape == expected_map.shape, fire
+        np.testing.assert_allclose(actual[0].numpy(), expected_map, rtol=1e-3, atol=1e-4 * expected_map.max())
+    encoding = unit(np.concatenate([references.grid(expected[fire], *CELLS) for fire in OUTPUT_FIRES]))
+    for runtime, least_cosine in PRECISIONS:
         extractor = loaded(squeezenet, path, runtime)
         assert (extractor.input_size, extractor.encoding_dim) == ((SIDES[family],) * 2, ENCODING_DIM)
-        assert cosine(extractor.encode([image])[0], whole) > least
+        assert cosine(extractor.encode([image])[0], encoding) > least_cosine
     other = "torchvision" if family == "caffe" else "caffe"  # the comparison tells another family's pixels
-    assert cosine(squeezenet_encoding(parameters, image, other), whole) < 0.999
+    assert cosine(squeezenet_encoding(parameters, image, other), encoding) < 0.999
     assert len(SqueezeNet((4,)).fires) == 3, "only what is taken is computed"
 
 
@@ -167,5 +167,5 @@ def test_the_published_squeezenet(real_data):
         published = {name: arrays[name] for name in arrays.files}
     image = scene(227, 227)
     expected = squeezenet_encoding(published, image, "caffe")
-    for runtime, least in PRECISIONS:
-        assert cosine(loaded(squeezenet, path, runtime).encode([image])[0], expected) > least
+    for runtime, least_cosine in PRECISIONS:
+        assert cosine(loaded(squeezenet, path, runtime).encode([image])[0], expected) > least_cosine

@@ -33,13 +33,13 @@ def model(
         [helper.make_tensor_value_info("y", TensorProto.FLOAT, output)],
         [numpy_helper.from_array(WEIGHTS, "weights")],
     )  # fmt: skip
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid(*each) for each in opsets], ir_version=9)
-    helper.set_model_props(made, {f"deepsimbad.{name}": text for name, text in (metadata or {}).items()})
-    return made
+    proto = helper.make_model(graph, opset_imports=[helper.make_opsetid(*opset) for opset in opsets], ir_version=9)
+    helper.set_model_props(proto, {f"deepsimbad.{name}": text for name, text in (metadata or {}).items()})
+    return proto
 
 
-def load(folder, made, **compute):
-    (folder / "places.onnx").write_bytes(made if isinstance(made, bytes) else made.SerializeToString())
+def load(folder, content, **compute):
+    (folder / "places.onnx").write_bytes(content if isinstance(content, bytes) else content.SerializeToString())
     return onnx_file("places.onnx", Compute(weights_dir=folder, **compute))
 
 
@@ -50,16 +50,16 @@ def images(n=3, size=(20, 30)):
 def by_hand(images, scale=1 / 255, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225), bgr=False):
     means = np.stack([image.astype(np.float64).mean(axis=(0, 1)) for image in images])
     means = means if bgr else means[:, ::-1]
-    given = ((means * scale - mean) / std) @ WEIGHTS
-    return given / np.linalg.norm(given, axis=1, keepdims=True)
+    vectors = ((means * scale - mean) / std) @ WEIGHTS
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def test_a_file_encodes_as_its_graph_says(tmp_path):
     extractor = load(tmp_path, model())
     assert (extractor.input_size, extractor.encoding_dim, extractor.largest_batch) == ((30, 20), D, 1)
-    given = extractor.encode(images())
-    assert given.dtype == np.float32
-    np.testing.assert_allclose(given, by_hand(images()), atol=1e-3)
+    encodings = extractor.encode(images())
+    assert encodings.dtype == np.float32
+    np.testing.assert_allclose(encodings, by_hand(images()), atol=1e-3)
     assert extractor.weights_sha256 == hashlib.sha256((tmp_path / "places.onnx").read_bytes()).hexdigest()
 
 
@@ -82,25 +82,25 @@ def test_sides_that_are_open_and_batches_that_are_not(tmp_path, shape, size):
     extractor = load(tmp_path, model(shape, output=(shape[0], D)), largest_batch=4)
     assert extractor.input_size == size
     assert extractor.largest_batch == (1 if shape[0] == 1 else 4)
-    same = images(size=size[::-1])
-    np.testing.assert_allclose(extractor.encode(same), by_hand(same), atol=1e-3)
+    scenes = images(size=size[::-1])
+    np.testing.assert_allclose(extractor.encode(scenes), by_hand(scenes), atol=1e-3)
 
 
 def test_how_images_are_shown_is_told_by_the_file(tmp_path):
-    told = {"mean": "[0.5, 0.4, 0.3]", "std": "[1, 2, 3]", "scale": "0.01", "channels": "BGR"}
-    extractor = load(tmp_path, model(metadata=told))
-    wanted = by_hand(images(), 0.01, (0.5, 0.4, 0.3), (1, 2, 3), bgr=True)
-    np.testing.assert_allclose(extractor.encode(images()), wanted, atol=1e-3)
-    told = {"mean": "[123, 117, 104]", "std": "[1, 1, 1]", "scale": "[1, 1, 1]", "layout": "NHWC"}
-    extractor = load(tmp_path, model(("n", 20, 30, 3), metadata=told, axes=(1, 2)))
+    metadata = {"mean": "[0.5, 0.4, 0.3]", "std": "[1, 2, 3]", "scale": "0.01", "channels": "BGR"}
+    extractor = load(tmp_path, model(metadata=metadata))
+    expected = by_hand(images(), 0.01, (0.5, 0.4, 0.3), (1, 2, 3), bgr=True)
+    np.testing.assert_allclose(extractor.encode(images()), expected, atol=1e-3)
+    metadata = {"mean": "[123, 117, 104]", "std": "[1, 1, 1]", "scale": "[1, 1, 1]", "layout": "NHWC"}
+    extractor = load(tmp_path, model(("n", 20, 30, 3), metadata=metadata, axes=(1, 2)))
     np.testing.assert_allclose(extractor.encode(images()), by_hand(images(), 1, (123, 117, 104), (1, 1, 1)), atol=1e-3)
     extractor = load(tmp_path, model(metadata={"channels": "BGR"}))
-    wanted = by_hand(images(), mean=(0.406, 0.456, 0.485), std=(0.225, 0.224, 0.229), bgr=True)
-    np.testing.assert_allclose(extractor.encode(images()), wanted, atol=1e-3)
+    expected = by_hand(images(), mean=(0.406, 0.456, 0.485), std=(0.225, 0.224, 0.229), bgr=True)
+    np.testing.assert_allclose(extractor.encode(images()), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize(
-    "told",
+    "metadata",
     [
         {"means": "[1, 2, 3]"},
         {"mean": "[1, 2]"},
@@ -116,9 +116,9 @@ def test_how_images_are_shown_is_told_by_the_file(tmp_path):
     ],
     ids=str,
 )
-def test_metadata_that_means_nothing_is_refused(tmp_path, told):
-    with pytest.raises(InvalidWeightsError, match=f"deepsimbad.{next(iter(told))}"):
-        load(tmp_path, model(metadata=told))
+def test_metadata_that_means_nothing_is_refused(tmp_path, metadata):
+    with pytest.raises(InvalidWeightsError, match=f"deepsimbad.{next(iter(metadata))}"):
+        load(tmp_path, model(metadata=metadata))
 
 
 def test_maps_of_one_cell_are_encodings(tmp_path):
@@ -132,8 +132,8 @@ def test_an_image_in_which_nothing_is_seen_has_a_neutral_encoding(tmp_path):
         helper.make_node("ReduceMean", ["x"], ["means"], axes=[2, 3], keepdims=0),
         helper.make_node("Sub", ["means", "means"], ["y"]),
     ]
-    given = load(tmp_path, model(nodes=nodes, output=("n", 3))).encode(images())
-    np.testing.assert_allclose(given, 3**-0.5, atol=1e-3)
+    encodings = load(tmp_path, model(nodes=nodes, output=("n", 3))).encode(images())
+    np.testing.assert_allclose(encodings, 3**-0.5, atol=1e-3)
 
 
 def _node(name, *inputs, **attributes):
@@ -141,7 +141,7 @@ def _node(name, *inputs, **attributes):
 
 
 @pytest.mark.parametrize(
-    ("made", "told"),
+    ("make_file", "message"),
     [
         (lambda: model(("n", 1, 20, 30), nodes=_node("Identity", "x"), output=("n", 1, 20, 30)), "takes tensor"),
         (lambda: model(("n", 20, 30, 3), axes=(1, 2)), "takes tensor"),
@@ -160,9 +160,9 @@ def _node(name, *inputs, **attributes):
         (lambda: b"\x00" * 1000, "no whole ONNX file"),
     ],
 )  # fmt: skip
-def test_what_gives_no_encodings_is_refused(tmp_path, capfd, made, told):
-    with pytest.raises(InvalidWeightsError, match=told) as refused:
-        load(tmp_path, made())
+def test_what_gives_no_encodings_is_refused(tmp_path, capfd, make_file, message):
+    with pytest.raises(InvalidWeightsError, match=message) as refused:
+        load(tmp_path, make_file())
     assert "places.onnx" in refused.value.message
     assert capfd.readouterr() == ("", "")
 
@@ -177,24 +177,24 @@ def test_numbers_that_are_none_are_refused(tmp_path):
         load(tmp_path, model(nodes=nodes, output=("n", 3)))
 
 
-@pytest.mark.parametrize("where", ["initializer", "constant", "branch"])
-def test_data_in_another_file_is_refused(tmp_path, where):
-    made = model()
+@pytest.mark.parametrize("location", ["initializer", "constant", "branch"])
+def test_data_in_another_file_is_refused(tmp_path, location):
+    proto = model()
     outside = onnx.TensorProto(name="weights", data_type=TensorProto.FLOAT, dims=[3, D])
     outside.data_location = TensorProto.EXTERNAL
     outside.external_data.add(key="location", value="../secret")
-    if where == "initializer":
-        made.graph.initializer[0].CopyFrom(outside)
+    if location == "initializer":
+        proto.graph.initializer[0].CopyFrom(outside)
     else:
         constant = helper.make_node("Constant", [], ["c"], value=outside)
-        if where == "branch":
+        if location == "branch":
             branch = helper.make_graph(
                 [constant], "b", [], [helper.make_tensor_value_info("c", TensorProto.FLOAT, (3, D))]
             )
             constant = helper.make_node("If", ["when"], ["c"], then_branch=branch, else_branch=branch)
-        made.graph.node.append(constant)
+        proto.graph.node.append(constant)
     with pytest.raises(InvalidWeightsError, match="keeps its numbers in another file"):
-        load(tmp_path, made)
+        load(tmp_path, proto)
 
 
 def test_a_file_is_held_to_what_was_recorded(tmp_path):

@@ -24,8 +24,8 @@ def test_defaults_are_filled_in():
 
 
 def test_order_does_not_matter():
-    one = evaluator_config({"extractor": "none", "kind": "feature_l2"})
-    assert one.as_dict() == evaluator_config({"kind": "feature_l2", "extractor": "none"}).as_dict()
+    config = evaluator_config({"extractor": "none", "kind": "feature_l2"})
+    assert config.as_dict() == evaluator_config({"kind": "feature_l2", "extractor": "none"}).as_dict()
 
 
 @pytest.mark.parametrize(

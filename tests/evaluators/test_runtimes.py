@@ -21,14 +21,14 @@ from deepsimbad.evaluators.runtimes import make_run
 class Hungry(nn.Module):
     """The first pixel of every image; more images at once than it may take do not fit the memory."""
 
-    def __init__(self, most: int, error: Exception) -> None:
+    def __init__(self, n_most: int, error: Exception) -> None:
         super().__init__()
         self.trunk = nn.Identity()
-        self.most, self.error, self.batches = most, error, []
+        self.n_most, self.error, self.batches = n_most, error, []
 
     def forward(self, pixels):
         self.batches.append(len(pixels))
-        if len(pixels) > self.most:
+        if len(pixels) > self.n_most:
             raise self.error
         return pixels[:, 0, 0, :1].float()
 
@@ -106,8 +106,10 @@ for body in large:
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the limit is Linux's")
 def test_a_decoder_without_memory_finds_no_fault_with_the_image():
-    done = subprocess.run([sys.executable, "-c", STARVED], capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) == {"starved"}, "a decoder that needs little more than the picture may do without"
+    process = subprocess.run([sys.executable, "-c", STARVED], capture_output=True, text=True, check=True)
+    assert set(process.stdout.split()) == {"starved"}, (
+        "a decoder that needs little more than the picture may do without"
+    )
 
 
 def test_too_little_memory_to_bring_an_image_to_size_is_named():

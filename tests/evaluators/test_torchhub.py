@@ -93,7 +93,7 @@ def nested():
 
 
 def leave_archive(folder, files, repository=REPOSITORY, commit=COMMIT):
-    """As somebody without a network would: the archive where a pull looks for it."""
+    """Put an archive where a pull looks for it, as somebody without a network would."""
     hub = folder / "hub"
     hub.mkdir(parents=True, exist_ok=True)
     path = hub / f"{repository.replace('/', '_')}_{commit}.zip"
@@ -115,10 +115,10 @@ def loaded(folder, entry="entry", **compute):
 
 @pytest.fixture(autouse=True)
 def _the_process_stays_as_it_was():
-    before = (set(sys.modules), list(sys.path), torch.hub.get_dir(), torch.hub.download_url_to_file, sys.stdout)
+    earlier_state = (set(sys.modules), list(sys.path), torch.hub.get_dir(), torch.hub.download_url_to_file, sys.stdout)
     yield
     assert "places_model" not in sys.modules
-    assert (list(sys.path), torch.hub.get_dir(), torch.hub.download_url_to_file, sys.stdout) == before[1:]
+    assert (list(sys.path), torch.hub.get_dir(), torch.hub.download_url_to_file, sys.stdout) == earlier_state[1:]
 
 
 def scenes(n=3):
@@ -126,7 +126,7 @@ def scenes(n=3):
 
 
 def by_hand(image, dim=8):
-    """The same in plain numpy, but for resizing."""
+    """[dim] the encoding of an image in plain numpy, without resizing."""
     rgb = image[..., ::-1].astype(np.float64) / 255
     normalised = (rgb - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
     height, width = image.shape[:2]
@@ -147,15 +147,15 @@ def test_an_entry_encodes_as_its_model_says(tmp_path, capfd):
     extractor = loaded(tmp_path)
     assert capfd.readouterr() == ("", "")
     images = [np.ascontiguousarray(np.random.default_rng(i).integers(0, 255, (42, 28, 3), np.uint8)) for i in range(3)]
-    given = extractor.encode(images)
-    assert given.dtype == np.float32
-    np.testing.assert_allclose(given, [by_hand(image) for image in images], atol=3e-4)
+    encodings = extractor.encode(images)
+    assert encodings.dtype == np.float32
+    np.testing.assert_allclose(encodings, [by_hand(image) for image in images], atol=3e-4)
     assert (extractor.encoding_dim, extractor.input_size) == (8, SIZE)
     by_name = make_evaluator(  # which may be in capitals
         evaluator_config({"kind": "feature_l2", "extractor": "torchhub:SOMEONE/places:entry"}),
         Compute(weights_dir=tmp_path, device=Device.CPU),
     )
-    np.testing.assert_array_equal(by_name.encode(images), given)
+    np.testing.assert_array_equal(by_name.encode(images), encodings)
     assert by_name.weights_sha256 == extractor.weights_sha256 == record.weights_sha256
 
 
@@ -166,21 +166,21 @@ def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, entry, ar
     """Also of several outputs, of one that sees nothing, and of a model for several devices."""
     pulled(tmp_path, entry, arguments=arguments)
     extractor = loaded(tmp_path, entry, largest_batch=2)
-    given = extractor.encode(scenes())
-    np.testing.assert_allclose(np.linalg.norm(given, axis=1), 1, rtol=1e-3)
-    np.testing.assert_allclose(given, [extractor.encode([image])[0] for image in scenes()], atol=3e-4)
+    encodings = extractor.encode(scenes())
+    np.testing.assert_allclose(np.linalg.norm(encodings, axis=1), 1, rtol=1e-3)
+    np.testing.assert_allclose(encodings, [extractor.encode([image])[0] for image in scenes()], atol=3e-4)
 
 
 def test_by_itself_it_is_computed_in_float32(tmp_path):
     pulled(tmp_path)
-    by_itself, asked = loaded(tmp_path).encode(scenes()), loaded(tmp_path, runtime=Runtime.TORCH).encode(scenes())
-    np.testing.assert_array_equal(by_itself, asked)
+    by_itself, in_float32 = loaded(tmp_path).encode(scenes()), loaded(tmp_path, runtime=Runtime.TORCH).encode(scenes())
+    np.testing.assert_array_equal(by_itself, in_float32)
     with contextlib.suppress(InvalidWeightsError):  # a model may be unable to; this one is not
-        np.testing.assert_allclose(loaded(tmp_path, runtime=Runtime.TORCH_BF16).encode(scenes()), asked, atol=0.05)
+        np.testing.assert_allclose(loaded(tmp_path, runtime=Runtime.TORCH_BF16).encode(scenes()), in_float32, atol=0.05)
 
 
 @pytest.mark.parametrize(
-    ("entry", "arguments", "told"),
+    ("entry", "arguments", "message"),
     [
         ("entry", {"form": "dict"}, "gives dict for 2 images"),
         ("entry", {"form": "map"}, r"gives \[2, 3, 42, 28\] for 2 images"),
@@ -198,8 +198,8 @@ def test_by_itself_it_is_computed_in_float32(tmp_path):
         ("random", {}, "not the same each time"),
     ],
 )
-def test_what_gives_no_encodings_is_not_recorded(tmp_path, entry, arguments, told):
-    with pytest.raises(InvalidWeightsError, match=told):
+def test_what_gives_no_encodings_is_not_recorded(tmp_path, entry, arguments, message):
+    with pytest.raises(InvalidWeightsError, match=message):
         pulled(tmp_path, entry, arguments=arguments)
     assert not (tmp_path / LOCK).exists()
     with pytest.raises(MissingWeightsError, match=f"weights pull torchhub:{REPOSITORY}:{entry}"):
@@ -212,11 +212,11 @@ def test_a_model_that_does_not_fit_the_memory_is_no_invalid_one(tmp_path, dim):
         pulled(tmp_path, arguments={"dim": dim})
 
 
-@pytest.mark.parametrize("listed", [True, False])
-def test_a_package_that_it_needs_is_named(tmp_path, listed):
-    text = HUBCONF.replace('["torch"]', '["torch", "a_package_nobody_has"]') if listed else HUBCONF
+@pytest.mark.parametrize("is_listed", [True, False])
+def test_a_package_that_it_needs_is_named(tmp_path, is_listed):
+    text = HUBCONF.replace('["torch"]', '["torch", "a_package_nobody_has"]') if is_listed else HUBCONF
     with pytest.raises(MissingPackageError, match="needs a_package_nobody_has"):
-        pulled(tmp_path, "entry" if listed else "needing", {"hubconf.py": text, "places_model.py": MODEL})
+        pulled(tmp_path, "entry" if is_listed else "needing", {"hubconf.py": text, "places_model.py": MODEL})
 
 
 def test_a_module_that_the_repository_lacks_itself_is_no_package(tmp_path):
@@ -226,16 +226,16 @@ def test_a_module_that_the_repository_lacks_itself_is_no_package(tmp_path):
 
 
 def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypatch):
-    asked = []
+    requests = []
 
-    def fetch(url, to, tell, sha256=None, advice=""):
-        asked.append((url, sha256))
-        to.parent.mkdir(exist_ok=True)
-        torch.save({"project.weight": torch.ones(8, 12)}, to)
+    def fetch(url, target, tell, sha256=None, advice=""):
+        requests.append((url, sha256))
+        target.parent.mkdir(exist_ok=True)
+        torch.save({"project.weight": torch.ones(8, 12)}, target)
 
     monkeypatch.setattr(downloads, "fetch", fetch)
     record = pulled(tmp_path, "checkpoint")
-    assert asked == [("http://127.0.0.1:9/places.pth", None)]
+    assert requests == [("http://127.0.0.1:9/places.pth", None)]
     checkpoint = tmp_path / "hub" / "checkpoints" / "places.pth"
     assert list(record.beside) == ["checkpoints/places.pth"]
     np.testing.assert_allclose(np.abs(loaded(tmp_path, "checkpoint").encode(scenes())), 8**-0.5, rtol=1e-3)
@@ -250,33 +250,33 @@ def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypa
     checkpoint.unlink()
     again = pulled(tmp_path, "checkpoint")
     assert again == record
-    assert asked[1:] == [("http://127.0.0.1:9/places.pth", record.beside["checkpoints/places.pth"])]
+    assert requests[1:] == [("http://127.0.0.1:9/places.pth", record.beside["checkpoints/places.pth"])]
 
 
 def test_a_pull_without_a_network_says_what_to_put_where(tmp_path):
     place = tmp_path / "hub" / "checkpoints" / "places.pth"
-    with pytest.raises(MissingWeightsError, match=r"127\.0\.0\.1:9/places\.pth cannot be reached") as told:
+    with pytest.raises(MissingWeightsError, match=r"127\.0\.0\.1:9/places\.pth cannot be reached") as error:
         pulled(tmp_path, "checkpoint")
-    assert str(place) in told.value.message
+    assert str(place) in error.value.message
     torch.save({"project.weight": torch.ones(8, 12)}, place)
     assert list(pulled(tmp_path, "checkpoint").beside) == ["checkpoints/places.pth"]
 
 
 def test_loading_asks_nothing_of_a_network(tmp_path):
-    """An entry that swallows the first refusal, and one whose record knows nothing of its download."""
+    """Neither an entry that swallows the first refusal, nor one whose record does not hold its download."""
     with pytest.raises(InvalidWeightsError, match="ConnectionRefusedError"):
         pulled(tmp_path, "secret")
     record = pulled(tmp_path)
     for entry, address in (("secret", "127.0.0.1"), ("checkpoint", "http://127.0.0.1:9/places.pth for ")):
         lock = Lock.read(tmp_path)
         lock.with_hub(f"torchhub:{REPOSITORY}:{entry}", replace(record, arguments={})).write()
-        with pytest.raises(MissingWeightsError, match="nothing is downloaded while it is loaded") as told:
+        with pytest.raises(MissingWeightsError, match="nothing is downloaded while it is loaded") as error:
             loaded(tmp_path, entry)
-        assert address in told.value.message
+        assert address in error.value.message
 
 
 def test_other_repositories_that_it_loads_are_recorded_too(tmp_path, monkeypatch):
-    """One that torch hub has put there; offline it is found by its folder's name."""
+    """Torch hub has put one there; offline it is found by its folder's name."""
     inner = tmp_path / "hub" / "elsewhere_backbone_main"
     inner.mkdir(parents=True)
     (inner / "hubconf.py").write_text("from inner_model import Inner\n\ndef backbone():\n    return Inner()\n")
@@ -313,13 +313,13 @@ def test_a_tree_that_was_changed_is_not_run(tmp_path, change):
         (tree / "places_model.py").unlink()
     else:
         tree.rename(tmp_path / "elsewhere")
-    error = MissingWeightsError if change == "gone" else InvalidWeightsError
-    with pytest.raises(error) as told:
+    error_type = MissingWeightsError if change == "gone" else InvalidWeightsError
+    with pytest.raises(error_type) as error:
         loaded(tmp_path)
     assert not mark.exists()
-    assert record.folder in told.value.message
+    assert record.folder in error.value.message
     if change != "gone":
-        assert record.tree_sha256 in told.value.message
+        assert record.tree_sha256 in error.value.message
     assert pulled(tmp_path) == record, "a pull mends it"
     assert loaded(tmp_path).encoding_dim == 8
 

@@ -37,8 +37,8 @@ def refused(path, message=None, extractor=netvlad):
     assert path.name in caught.value.message
 
 
-def whole(folder, family):
-    """A file of a family, and what reads it."""
+def write_weights(folder, family):
+    """Write a file of a family; returns its path and its extractor."""
     path = folder / f"{family}.weights"
     if family in NETVLAD_WRITERS:
         NETVLAD_WRITERS[family](path, random_network(family))
@@ -56,7 +56,7 @@ def test_a_missing_file_says_where_to_put_it(tmp_path, extractor):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_truncated_file(tmp_path, family):
-    path, extractor = whole(tmp_path, family)
+    path, extractor = write_weights(tmp_path, family)
     body = path.read_bytes()
     for share in (0.0, 0.001, 0.1, 0.5, 0.97):
         path.write_bytes(body[: int(len(body) * share)])
@@ -85,7 +85,7 @@ def test_no_file_of_weights_at_all(tmp_path, body, extractor):
 
 @pytest.mark.parametrize("family", NETVLAD_WRITERS)
 def test_flipped_bytes_end_in_a_named_error_or_in_other_numbers(tmp_path, family):
-    path, extractor = whole(tmp_path, family)
+    path, extractor = write_weights(tmp_path, family)
     body, random = path.read_bytes(), np.random.default_rng(2)
     for _ in range(40):
         harmed = bytearray(body)
@@ -98,7 +98,7 @@ def test_flipped_bytes_end_in_a_named_error_or_in_other_numbers(tmp_path, family
 
 @pytest.mark.parametrize("family", ["pytorch_netvlad", "patch_netvlad", "openibl", "torchvision"])
 def test_a_parameter_too_many_or_too_few_is_another_network(tmp_path, family):
-    path, extractor = whole(tmp_path, family)
+    path, extractor = write_weights(tmp_path, family)
     content = torch.load(path, weights_only=False)
     names = content.get("state_dict", content)
     first = next(iter(names))

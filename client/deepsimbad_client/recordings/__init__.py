@@ -18,7 +18,7 @@ from PIL import Image as Pictures
 
 from deepsimbad.core.frames import UNKNOWN_TIMESTAMP
 from deepsimbad.errors import DeepSimbadError
-from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits, measured
+from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits, measured_levels
 from deepsimbad.evaluators.image import decode_deep as decode_file
 from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.image_files import ImageFile
@@ -243,7 +243,7 @@ def with_grey_levels(recording: AnyRecording, image: Callable[[int], NDArray[Any
         pictures += [picture] if picture.dtype == np.uint16 else []
     if not pictures:
         return recording
-    levels = measured(pictures)
+    levels = measured_levels(pictures)
     remark = f"images of more than 8 bits are shown as 8: {levels[0]} is black, {levels[1]} white"
     return dataclasses.replace(recording, grey_levels=levels, remarks=[*recording.remarks, remark])
 

@@ -74,8 +74,8 @@ async def scene_in(
         scene, image = Scene.of_form(body)
     else:
         scene = Scene.read(document) if media_type == JSON else Scene.of_body(body, media_type)
-    scene.of(evaluator.forms)
+    scene.check_forms(evaluator.forms)
     if image is None:
         return scene, None
     decoded = await running.decoders.decoded(image, evaluator, priority, levels, cameras)
-    return scene.beside(decoded.image), decoded
+    return scene.with_image(decoded.image), decoded

@@ -38,7 +38,7 @@ from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES, ImageFile
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
-from deepsimbad.evaluators.scenes import Scene, seen_in
+from deepsimbad.evaluators.scenes import Scene, read_observation
 from deepsimbad.jobs.build import EncodedBlock, encode_recording
 from deepsimbad.jobs.fitting import RecordingPictures, learns
 from deepsimbad.jobs.remap import remap
@@ -294,7 +294,7 @@ def _view_in(
         levels = levels_in(snapshot.landmark_model)
         decoded = Decoded.of(ImageFile.read(body, max_pixels), body, evaluator, levels, snapshot.cameras)
         return NothingSeen() if decoded.is_blank else decoded.image, decoded.remarks
-    scene = seen_in(body, media_type, evaluator, max_pixels)
+    scene = read_observation(body, media_type, evaluator, max_pixels)
     return scene, scene.remarks if isinstance(scene, Scene) else ()
 
 

@@ -5,7 +5,6 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from importlib.util import find_spec
 from typing import Any
 
@@ -28,7 +27,7 @@ from deepsimbad.cli.terminal import (
 from deepsimbad.errors import InvalidInputError, MissingWeightsError
 from deepsimbad.evaluators.registry import EXTRACTOR_FORMS, EXTRACTOR_PATTERN
 from deepsimbad.evaluators.weights.downloads import HubWish, Tell, pull_file, pull_hub
-from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, canonical, known
+from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, canonical, known_weights
 from deepsimbad.evaluators.weights.lock import HUB_FOLDER, Lock
 
 _SHA256 = re.compile(r"[0-9a-fA-F]{8,64}")
@@ -122,20 +121,22 @@ def verify(context: click.Context, names: tuple[str, ...], as_json: bool) -> Non
     findings = [finding for name in _recorded(lock, names) for finding in lock.findings(name)]
     are_good = all(finding.is_good for finding in findings)
     if as_json:
-        write_json(
-            {"ok": are_good, "findings": [{**asdict(finding), "path": str(finding.path)} for finding in findings]}
-        )
+        rows = [
+            {"path": str(finding.path), "recorded": finding.recorded_sha256, "found": finding.sha256}
+            for finding in findings
+        ]
+        write_json({"ok": are_good, "findings": rows})
     for finding in [] if as_json else findings:
-        state = "good" if finding.is_good else "missing" if finding.found is None else "differs"
-        recorded = "" if finding.is_good else f" (recorded: {finding.recorded})"
-        click.echo(f"{state}: {finding.path}: {finding.found or 'not there'}{recorded}")
+        state = "good" if finding.is_good else "missing" if finding.sha256 is None else "differs"
+        recorded = "" if finding.is_good else f" (recorded: {finding.recorded_sha256})"
+        click.echo(f"{state}: {finding.path}: {finding.sha256 or 'not there'}{recorded}")
     if not are_good:
         context.exit(1)
 
 
 def _extractor(name: str) -> str:
     """The extractor that a name means, as a configuration would name it."""
-    listed = known(name)
+    listed = known_weights(name)
     extractor = name if listed is None else listed.extractor
     if listed is not None and listed.package is not None:
         raise InvalidInputError(f"{name} comes with the package {listed.package}: there is nothing to pull")

@@ -31,7 +31,7 @@ from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.image import is_blank
 from deepsimbad.evaluators.registry import EvaluatorKind
 from deepsimbad.evaluators.scenes import Scene
-from deepsimbad.evaluators.space import seen, squared_between
+from deepsimbad.evaluators.space import dissimilarities_and_vectors, squared_between
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
@@ -191,7 +191,7 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         view = evaluator.prepare(view)
         view = NothingSeen() if is_blank(view) else encode_images(evaluator, [view])[0]
     if isinstance(view, Scene):
-        view = NothingSeen() if view.is_blank else encode_images(evaluator, [view.of(evaluator.forms)])[0]
+        view = NothingSeen() if view.is_blank else encode_images(evaluator, [view.check_forms(evaluator.forms)])[0]
     if isinstance(view, NothingSeen):
         return Query.uninformative(n_landmarks)
     if isinstance(view, EncodedImage):
@@ -199,8 +199,8 @@ def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:
         encoding = view.values
     else:
         encoding = ready_encodings(view.values[np.newaxis])[0]
-    dissimilarities, compared_encodings = seen(evaluator, encoding[None, :], snapshot.landmark_model)
-    return Query(rank_landmarks(dissimilarities[0]), dissimilarities[0], compared_encodings[0])
+    dissimilarities, vectors = dissimilarities_and_vectors(evaluator, encoding[None, :], snapshot.landmark_model)
+    return Query(rank_landmarks(dissimilarities[0]), dissimilarities[0], vectors[0])
 
 
 def _with_landmarks(snapshot: Map, view: PackedUnitEncoding) -> Dissimilarities:

@@ -4,17 +4,18 @@ The paper asks of an evaluator one thing only: a dissimilarity between a scene a
 `encode` and `dissimilarities`, so that each image is encoded once however often the landmarks change.
 
 **Fitted evaluators.** `fit` makes the landmark model, named arrays that a map keeps and a robot gets, of a `Lesson`:
-the landmarks and all that is known around them. What it learnt from is said by `fitting`; where that is images, those
-of a traverse wait in its spool until a remap is made of it (`jobs.fitting`), and `Lesson.views` holds encodings of
+the landmarks and all that is known around them. `fitting` says what it learns from; where that is images, those of a
+traverse wait in its spool until a remap is made of it (`jobs.fitting`), and `Lesson.views` holds encodings of
 augmented views of every landmark. Without them (the spool is gone, encodings came ready) it fits on encodings alone.
 
 **composed** compares unit vectors. Where the dissimilarity is squared L2 (`is_squared_l2`) they are made of encodings;
 where it is any other, a scene's *dissimilarities to all fitted landmarks* take the encoding's place, as II-A has it:
-D(x, R) is a vector space, each landmark a dimension. `compared` gives the one or the other. All else, standardising by
-season, places as sums, lists, live statistics, is the same for all evaluators (docs/decisions/0029-own-space.md).
-`evaluators.space.OwnDissimilarities` does this for an evaluator that says its `own_dissimilarities`.
+D(x, R) is a vector space, each landmark a dimension. `comparison_vectors` gives the one or the other. All else,
+standardising by season, places as sums, lists, live statistics, is the same for all evaluators
+(docs/decisions/0029-own-space.md). `evaluators.space.OwnDissimilarities` does this for an evaluator that defines
+`own_dissimilarities`.
 
-Methods that keep the contract, and have no more to say of it, are described here alone.
+Methods of evaluators without a docstring do just what is described here.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -64,7 +65,7 @@ class Lesson:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What fitting came to."""
+    """The result of fitting: a landmark model, and what is known of it."""
 
     model: LandmarkModel
     metrics: Mapping[str, Any] = field(default_factory=dict)  # JSON-ready, for `metrics.fitting` of the map
@@ -84,7 +85,7 @@ class Evaluator(Protocol):
         """The forms of an observation that it makes encodings of; none where ready ones alone are taken."""
 
     def lacking(self, forms: frozenset["Form"]) -> frozenset["Form"]:
-        """Forms that a map's frame lacks, of which it needs one, when it is told in these; a live view may."""
+        """The forms of which a map's frame that has only `forms` needs one more; live views need none."""
 
     @property
     def takes_images(self) -> bool:
@@ -100,11 +101,11 @@ class Evaluator(Protocol):
 
     @property
     def halves(self) -> tuple[int, ...]:
-        """Lengths of the encodings that lie side by side in one; empty where it is one."""
+        """Lengths of the two encodings that lie side by side in a fused one; empty for others."""
 
     @property
     def weights_sha256(self) -> str | None:
-        """SHA-256 in hex that encodings are told apart by: of their weights, and of what is done with them; or None."""
+        """SHA-256 in hex of the weights and of how they are used, so that encodings can be told apart; or None."""
 
     @property
     def largest_batch(self) -> int:
@@ -114,10 +115,10 @@ class Evaluator(Protocol):
         """Load what encoding needs, now rather than at first need."""
 
     def prepare(self, image: Image) -> Image:
-        """Bring an image to the size it is encoded at; `encode` does so itself with one that was not."""
+        """Bring an image to the size it is encoded at; `encode` does so too with images that were not prepared."""
 
     def encode(self, images: "Sequence[Image | Scene]") -> NDArray[np.float32]:
-        """Encode n images, or scenes told in forms that it takes, to [n, d] float32, finite.
+        """Encode n images, or scenes in forms that it takes, to [n, d] float32, finite.
 
         No answer depends on its neighbours, beyond rounding.
         """
@@ -150,7 +151,7 @@ class Evaluator(Protocol):
             InvalidEncodingError: Wrong length, NaN or infinity, or so large that the dissimilarity overflows.
         """
 
-    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+    def comparison_vectors(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         """What `composed` makes unit vectors of: encodings [n, d] as they are, or own dissimilarities [n, r].
 
         Raises:
@@ -168,7 +169,7 @@ def is_lack_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def named_lack_of_memory(work: str) -> Iterator[None]:
-    """What anybody says of too little memory to `work` an image, as one error. All else passes."""
+    """Raise any library's error of too little memory to `work` an image as OutOfMemoryError, and others as they are."""
     try:
         yield
     except Exception as error:

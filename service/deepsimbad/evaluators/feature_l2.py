@@ -60,7 +60,7 @@ class FeatureL2:
 
     @property
     def weights_sha256(self) -> str | None:
-        """Of the extractor's weights; None without any."""
+        """See `Evaluator`; of the extractor, None without one."""
         return self._extractor.weights_sha256 if self.takes_images else None
 
     @property
@@ -124,17 +124,17 @@ class FeatureL2:
         if is_composed(model):
             return between_units(encodings, model)
         check_length(encodings, prototypes.shape[1])
-        answer = squared_distances(np.ascontiguousarray(encodings, np.float32), prototypes)
-        if not np.isfinite(answer).all():
+        dissimilarities = squared_distances(np.ascontiguousarray(encodings, np.float32), prototypes)
+        if not np.isfinite(dissimilarities).all():
             raise InvalidEncodingError("an encoding holds NaN, infinity or numbers too large to compare")
-        return answer
+        return dissimilarities
 
-    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:  # noqa: ARG002
+    def comparison_vectors(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:  # noqa: ARG002
         return encodings
 
 
 def checked_encodings(encodings: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Encodings of landmarks [r >= 1, d], finite; raises InvalidEncodingError."""
+    """Encodings of landmarks as they are; raises InvalidEncodingError unless they are [r >= 1, d] and finite."""
     if encodings.ndim != 2 or encodings.size == 0:
         raise InvalidEncodingError(f"landmark encodings are [r, d], not {list(encodings.shape)}")
     if not np.isfinite(encodings).all():
@@ -147,10 +147,10 @@ def squared_distances(scenes: NDArray[np.float32], landmarks: NDArray[np.float32
     """[n, r] squared L2 between [n, d] and [r, d], summed from differences.
 
     Not by a matrix product: |a|² + |b|² - 2ab cancels badly in float32, and rounds differently with the number of rows,
-    where an image must get the same ranks alone and in a batch. It is no slower than one in float64 either.
+    where an image must get the same ranks alone and in a batch. A product in float64 would be no faster.
     """
     n_numbers = scenes.shape[1]
-    answer = np.empty((len(scenes), len(landmarks)), np.float32)
+    distances = np.empty((len(scenes), len(landmarks)), np.float32)
     for first in range(0, len(scenes), _SCENES_AT_ONCE):
         for landmark in range(len(landmarks)):
             for scene in range(first, min(first + _SCENES_AT_ONCE, len(scenes))):
@@ -158,14 +158,14 @@ def squared_distances(scenes: NDArray[np.float32], landmarks: NDArray[np.float32
                 for start in range(0, n_numbers, _NUMBERS_A_SUM):  # short sums, for which float32 is enough
                     part = slice(start, start + _NUMBERS_A_SUM)
                     total += _squared_distance(scenes[scene, part], landmarks[landmark, part])
-                answer[scene, landmark] = total
-    return answer
+                distances[scene, landmark] = total
+    return distances
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _squared_distance(first: NDArray[np.float32], second: NDArray[np.float32]) -> np.float32:
     total = np.float32(0)
     for k in range(first.size):
-        apart = first[k] - second[k]
-        total += apart * apart
+        difference = first[k] - second[k]
+        total += difference * difference
     return total

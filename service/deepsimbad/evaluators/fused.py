@@ -1,9 +1,9 @@
-"""Two evaluators of one domain: an encoding is both of theirs, side by side, and a view is judged by what it brings.
+"""Two evaluators of one domain: an encoding is both of theirs, side by side, and a view may bring one half alone.
 
 A dissimilarity is the weighted mean of the halves' squared L2. Their weight is learnt with the landmarks, by how well
-either half alone and both together find the places that the other drive saw; a half that is missing of a view is all
-zeros, and left out. Where `composed` compares, each half has directions of its own, of equal strength, and within-place
-whitening weighs them; a missing half is taken to be as usual, and teaches nothing of what is.
+either half alone and both together find the places that the other drive saw; a half that a view lacks is all zeros, and
+left out. Where `composed` compares, each half has directions of its own, of equal strength, and within-place whitening
+weighs them; a half that a view lacks is taken as the mean, and does not enter live statistics.
 """
 
 from collections.abc import Sequence
@@ -20,14 +20,14 @@ from deepsimbad.evaluators.scenes import Form, Scene
 from deepsimbad.evaluators.space import as_usual, between_units, squared_between
 
 _WEIGHT = "fused_weight"
-_TRIED = np.linspace(0, 1, 11)  # of the first half
+_TRIED = np.linspace(0, 1, 11)  # weights of the first half
 _EVEN = 0.5
-_NEAR_FRAMES = 2  # of a drive that count as one place
+_NEAR_FRAMES = 2  # frames of a drive at most so far apart count as one place
 _MOST_ASKED = 512  # frames of the other drive that the weight is learnt from
 
 
 class Fused(FeatureL2):
-    """Squared L2 of two halves; each gives encodings of unit length."""
+    """Dissimilarity = weighted mean of the squared L2 of two halves, whose encodings are of unit length."""
 
     fitting = Fitting.ENCODINGS
 
@@ -50,8 +50,8 @@ class Fused(FeatureL2):
 
     @property
     def weights_sha256(self) -> str | None:
-        known = [half.weights_sha256 for half in self._halves if half.weights_sha256]
-        return "+".join(known) or None
+        digests = [half.weights_sha256 for half in self._halves if half.weights_sha256]
+        return "+".join(digests) or None
 
     @property
     def largest_batch(self) -> int:
@@ -62,33 +62,33 @@ class Fused(FeatureL2):
             half.load()
 
     def prepare(self, image: Image) -> Image:
-        taking = next((half for half in self._halves if half.takes_images), self._halves[0])
-        return taking.prepare(image)
+        image_half = next((half for half in self._halves if half.takes_images), self._halves[0])
+        return image_half.prepare(image)
 
     def lacking(self, forms: frozenset[Form]) -> frozenset[Form]:
         return frozenset().union(*(half.forms for half in self._halves if not half.forms & forms))
 
     def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
-        """See `Evaluator`: zeros in the place of a half that a view does not bring."""
-        scenes = [seen if isinstance(seen, Scene) else Scene(image=seen) for seen in images]
-        encodings, at = np.zeros((len(scenes), self.encoding_dim), np.float32), 0
+        """See `Evaluator`; zeros take the place of a half that a view does not bring."""
+        scenes = [observation if isinstance(observation, Scene) else Scene(image=observation) for observation in images]
+        encodings, column = np.zeros((len(scenes), self.encoding_dim), np.float32), 0
         for half, width in zip(self._halves, self.halves, strict=True):
-            rows = [row for row, scene in enumerate(scenes) if half.forms & scene.telling]
+            rows = [row for row, scene in enumerate(scenes) if half.forms & scene.informative_forms]
             if rows:
-                encodings[rows, at : at + width] = half.encode([scenes[row] for row in rows])
-            at += width
+                encodings[rows, column : column + width] = half.encode([scenes[row] for row in rows])
+            column += width
         return encodings
 
     def fit(self, lesson: Lesson) -> Fitted:
-        """See `Evaluator.fit`: landmarks are the model, and the weight of the first half."""
-        own = checked_encodings(lesson.encodings)
-        model = dict(self.fit_landmarks(own[lesson.landmarks]))
+        """See `Evaluator.fit`; the model is the landmarks and the weight of the first half."""
+        encodings = checked_encodings(lesson.encodings)
+        model = dict(self.fit_landmarks(encodings[lesson.landmarks]))
         weight, metrics = _EVEN, dict[str, Any]()
         if lesson.other is not None and len(lesson.places):
-            asked = np.linspace(0, len(lesson.places) - 1, min(len(lesson.places), _MOST_ASKED)).astype(np.intp)
-            true, frames = lesson.places[asked].T
-            apart = self._apart(lesson.other[frames], own)
-            scores = {share: _anr(share * apart[0] + (1 - share) * apart[1], true) for share in _TRIED}
+            rows = np.linspace(0, len(lesson.places) - 1, min(len(lesson.places), _MOST_ASKED)).astype(np.intp)
+            true, frames = lesson.places[rows].T
+            halves = self._half_dissimilarities(lesson.other[frames], encodings)
+            scores = {share: _anr(share * halves[0] + (1 - share) * halves[1], true) for share in _TRIED}
             weight = float(min(scores, key=lambda share: scores[share]))
             metrics = {"weight": weight, "anr": {f"{share:.1f}": score for share, score in scores.items()}}
         return Fitted({**model, _WEIGHT: np.array([weight], np.float32)}, metrics)
@@ -101,38 +101,38 @@ class Fused(FeatureL2):
 
     def dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
         if is_composed(model):
-            return between_units(as_usual(self.compared(encodings, model), model), model)
+            return between_units(as_usual(self.comparison_vectors(encodings, model), model), model)
         super().dissimilarities(encodings, model)  # which refuses what cannot be compared
         share = float(np.asarray(model.get(_WEIGHT, [_EVEN]), np.float32)[0])
-        first, second = self._apart(encodings, np.asarray(model["prototypes"], np.float32))
+        first, second = self._half_dissimilarities(encodings, np.asarray(model["prototypes"], np.float32))
         has_first, has_second = (np.any(half, axis=1, keepdims=True) for half in self._split(encodings))
-        both = share * first + (1 - share) * second
-        return np.asarray(np.where(has_first & has_second, both, np.where(has_first, first, second)), np.float32)
+        mean = share * first + (1 - share) * second
+        return np.asarray(np.where(has_first & has_second, mean, np.where(has_first, first, second)), np.float32)
 
-    def compared(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
-        """See `Evaluator.compared`: what a view lacks is not told."""
+    def comparison_vectors(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
+        """See `Evaluator.comparison_vectors`; a half that a view lacks is NaN."""
         if not is_composed(model) or encodings.ndim != 2 or encodings.shape[1] != model["usual"].shape[1]:
             return encodings
-        told = checked_encodings(encodings).copy()
-        for half in self._split(told):
+        vectors = checked_encodings(encodings).copy()
+        for half in self._split(vectors):
             half[~np.any(half, axis=1)] = np.nan
-        return told
+        return vectors
 
     def _split(self, encodings: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        at = self.halves[0]
-        return encodings[:, :at], encodings[:, at:]
+        column = self.halves[0]
+        return encodings[:, :column], encodings[:, column:]
 
-    def _apart(
+    def _half_dissimilarities(
         self, scenes: NDArray[np.float32], landmarks: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """[n, r] squared L2 of either half."""
+        """[n, r] squared L2 of the first half, and of the second."""
         first, second = map(squared_between, self._split(scenes), self._split(landmarks))
         return first, second
 
 
-def _anr(apart: NDArray[np.float32], true: NDArray[np.int64]) -> float:
-    """In percent, of queries among all frames of the other drive [n, m], by their own frames [n] or those beside."""
-    frames = np.arange(apart.shape[1])
+def _anr(dissimilarities: NDArray[np.float32], true: NDArray[np.int64]) -> float:
+    """ANR in percent of queries' dissimilarities [n, m] to frames, of which `true` [n] and its neighbours are right."""
+    frames = np.arange(dissimilarities.shape[1])
     near = np.abs(frames - true[:, np.newaxis]) <= _NEAR_FRAMES
-    best = np.where(near, apart, np.inf).min(axis=1, keepdims=True)
-    return float(100 * ((apart < best) & ~near).sum(axis=1).mean() / apart.shape[1])
+    best = np.where(near, dissimilarities, np.inf).min(axis=1, keepdims=True)
+    return float(100 * ((dissimilarities < best) & ~near).sum(axis=1).mean() / dissimilarities.shape[1])

@@ -1,8 +1,8 @@
 """Grey levels: what becomes black and what white of pictures of more than 8 bits a channel.
 
-Cameras of 10, 12 and 14 bits fill the low bits of 16, thermal ones a few hundred counts somewhere in the middle: the
-upper eight bits are all grey. So levels are measured over a recording, kept with its traverse and its map, and live
-views are shown by the same: docs/decisions/0025-grey-levels.md.
+Cameras of 10, 12 and 14 bits fill the low bits of 16, thermal ones a few hundred counts somewhere in the middle: their
+upper eight bits show nearly one grey. So levels are measured over a recording, kept with its traverse and its map, and
+live views are shown by the same: docs/decisions/0025-grey-levels.md.
 """
 
 from collections.abc import Iterable
@@ -17,10 +17,10 @@ GreyLevels: TypeAlias = tuple[int, int]
 """The greatest number that is shown black and the least that is shown white, 0 <= black < white <= 65535."""
 
 DEEPEST = 65535
-_ARRAY = "grey_levels"  # of a landmark model: landmarks are known as these levels show them
+_ARRAY = "grey_levels"  # in a landmark model: the levels by which the landmarks were shown
 _USUAL_WHITES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16))
 _OUTSIDE = 0.001  # share of the pixels at either end that may be a lamp or a broken pixel
-_USED = 0.5  # of a depth that is well exposed: it is shown as a camera's own 8 bits would be
+_USED = 0.5  # share of a depth from which pictures are well exposed, and shown as a camera's own 8 bits would be
 _MARGIN = 0.05  # of the range that is used, at either end, for other exposures
 _LEAST_RANGE = 64  # counts: less is a sensor's noise, which no stretching turns into a picture
 _CLIPPED = 0.2
@@ -35,46 +35,47 @@ FEW_GREYS = (
 )
 
 
-def measured(pictures: Iterable[NDArray[np.uint16]]) -> GreyLevels:
+def measured_levels(pictures: Iterable[NDArray[np.uint16]]) -> GreyLevels:
     """Levels that suit pictures [height, width, 3] uint16 of one camera.
 
-    The smallest usual depth that holds them, or of one that is used by less than half the stretch that is used.
+    They are 0 and the end of the smallest usual depth that holds the pictures, or, where less than half of that depth
+    is used, the ends of the range in use.
     """
     histogram = np.zeros(DEEPEST + 1, np.int64)
     for picture in pictures:
         histogram += np.bincount(picture[::2, ::2].ravel(), minlength=DEEPEST + 1)
     share = np.cumsum(histogram) / max(1, histogram.sum())
-    low, high = (int(np.searchsorted(share, at)) for at in (_OUTSIDE, 1 - _OUTSIDE))
+    low, high = (int(np.searchsorted(share, quantile)) for quantile in (_OUTSIDE, 1 - _OUTSIDE))
     white = next(white for white in _USUAL_WHITES if high <= white)
-    used = high - low
-    if white == _USUAL_WHITES[0] or used >= _USED * white or used < _LEAST_RANGE:
+    span = high - low
+    if white == _USUAL_WHITES[0] or span >= _USED * white or span < _LEAST_RANGE:
         return 0, white
-    margin = round(_MARGIN * used)
+    margin = round(_MARGIN * span)
     return max(0, low - margin), min(DEEPEST, high + margin)
 
 
-def shown(picture: NDArray[np.uint16], levels: GreyLevels) -> Image:
-    """A picture of 16 bits as 8, linear between the levels; of a whole depth these are its upper eight bits."""
+def scaled_picture(picture: NDArray[np.uint16], levels: GreyLevels) -> Image:
+    """A picture of 16 bits as 8, linear between the levels; by the levels of a whole depth, its upper eight bits."""
     black, white = levels
     table = np.clip((np.arange(DEEPEST + 1) - black) * 256 // (white + 1 - black), 0, 255).astype(np.uint8)
     return np.asarray(table[picture], np.uint8)
 
 
 def clips(picture: NDArray[Any], levels: GreyLevels) -> bool:
-    """Whether much of a picture of more than 8 bits is shown white; of what levels were measured on hardly any is."""
+    """Whether much of a picture of more than 8 bits is shown white, as hardly any of the pictures measured is."""
     return picture.dtype == np.uint16 and bool((picture[::2, ::2] >= levels[1]).mean() > _CLIPPED)
 
 
 def in_eight_bits(picture: NDArray[Any], levels: GreyLevels | None) -> tuple[Image, GreyLevels | None]:
-    """A picture of 8 bits as it is; one of more as 8, and by which levels: the given ones, else what suits it."""
+    """A picture of 8 bits as it is, and None; one of more bits as 8, and its levels: those given, else its own."""
     if picture.dtype == np.uint8:
         return picture, None
-    levels = levels or measured([picture])
-    return shown(picture, levels), levels
+    levels = levels or measured_levels([picture])
+    return scaled_picture(picture, levels), levels
 
 
 def levels_in(model: LandmarkModel) -> GreyLevels | None:
-    """By which levels the images of a map were shown; None: they had 8 bits."""
+    """The levels by which the images of a map were shown; None: they had 8 bits."""
     if _ARRAY not in model:
         return None
     black, white = model[_ARRAY].tolist()
@@ -82,9 +83,9 @@ def levels_in(model: LandmarkModel) -> GreyLevels | None:
 
 
 def with_levels(model: LandmarkModel, levels: GreyLevels | None) -> LandmarkModel:
-    """A landmark model that says by which levels its map's images were shown; None: they had 8 bits."""
-    others = {name: array for name, array in model.items() if name != _ARRAY}
-    return others if levels is None else {**others, _ARRAY: np.array(levels, np.int64)}
+    """A landmark model with the levels by which its map's images were shown; None: they had 8 bits."""
+    arrays = {name: array for name, array in model.items() if name != _ARRAY}
+    return arrays if levels is None else {**arrays, _ARRAY: np.array(levels, np.int64)}
 
 
 def holds_few_greys(image: Image) -> bool:

@@ -1,9 +1,9 @@
 """The one place where images are decoded: JPEG, PNG, TIFF and WebP bytes -> upright 8-bit BGR.
 
-EXIF (and TIFF) orientation is applied; grey becomes three equal channels; of 16 bits a channel 8 are shown, by the
-grey levels of a recording (`evaluators.grey_levels`); alpha is dropped (PNG and WebP give their colours as stored,
-TIFF's come composited on black); of several pages or animation frames the first is taken and no other decoded. An image
-of more than `KEPT_PIXELS` is reduced by a whole factor, whoever decodes it: no extractor needs so many, and looking at
+EXIF (and TIFF) orientation is applied; grey becomes three equal channels; 16 bits a channel become 8, by the grey
+levels of a recording (`evaluators.grey_levels`); alpha is dropped (PNG and WebP give their colours as stored, TIFF's
+come composited on black); of several pages or animation frames the first is taken and no other decoded. An image of
+more than `KEPT_PIXELS` is reduced by a whole factor, whoever decodes it: no extractor needs so many pixels, and work on
 them would keep live views waiting.
 """
 
@@ -29,9 +29,9 @@ KEPT_PIXELS = 3840 * 2160
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 _BLANK_BELOW_STD = 1.0  # grey levels of 256
-_FIELDS, _BLANK_BELOW_SHARE = 8, 0.25  # a side; of all variation, how much is left between the means of fields
+_FIELDS, _BLANK_BELOW_SHARE = 8, 0.25  # fields a side; share of all variation that lies between their means
 THUMBNAIL_HEIGHT = 96  # pixels; of a JPEG of some 2 kB
-_WIDEST, _THUMBNAIL_QUALITY = 2.0, 60  # its width by its height
+_WIDEST, _THUMBNAIL_QUALITY = 2.0, 60  # a thumbnail's width by its height; its JPEG quality
 _DECODER_BYTES = 9  # a pixel: the picture, and the coefficients of a progressive JPEG
 _DTYPES = (np.uint8, np.uint16)
 _UPRIGHT: Mapping[int, Callable[[cv2.typing.MatLike], cv2.typing.MatLike]] = {  # by Exif's orientation
@@ -55,8 +55,8 @@ def decode_file(file: ImageFile, *, as_stored: bool = False, levels: GreyLevels 
     """[height, width, 3] uint8 BGR; height x width is at most `KEPT_PIXELS`.
 
     Args:
-        as_stored: The pixels as they lie in the file, whatever it says of its orientation.
-        levels: By which more than 8 bits are shown; None: by those that suit the picture itself.
+        as_stored: Give the pixels as they lie in the file, whatever its orientation is.
+        levels: Grey levels by which more than 8 bits are shown; None: those that suit the picture itself.
 
     Raises:
         InvalidImageError: It is damaged; TruncatedImageError where a part of its picture is missing.
@@ -66,7 +66,7 @@ def decode_file(file: ImageFile, *, as_stored: bool = False, levels: GreyLevels 
 
 
 def decode_deep(file: ImageFile, *, as_stored: bool = False) -> NDArray[Any]:
-    """As `decode_file`, but of 9 to 16 bits a channel all, as uint16."""
+    """As `decode_file`, but 9 to 16 bits a channel are all kept, as uint16."""
     try:
         with named_lack_of_memory("decode"):
             if file.media_type == JPEG:
@@ -79,30 +79,30 @@ def decode_deep(file: ImageFile, *, as_stored: bool = False) -> NDArray[Any]:
                 if not as_stored and file.orientation in _UPRIGHT:
                     image = _UPRIGHT[file.orientation](image)
                 return _reduced(np.ascontiguousarray(image))
-            np.empty(_DECODER_BYTES * file.n_pixels, np.uint8)  # codecs say of too little memory what of damage
+            np.empty(_DECODER_BYTES * file.n_pixels, np.uint8)  # codecs report too little memory as damage
     except cv2.error as error:
         raise InvalidImageError("the image cannot be decoded") from error
     raise InvalidImageError("the image cannot be decoded")
 
 
 def picture_size(body: bytes) -> tuple[int, int] | None:
-    """(width, height) of a whole picture as it is shown: upright, its pixels square; None where nobody can tell.
+    """(width, height) of a whole picture as it is shown: upright, its pixels square; None where it cannot be read.
 
     A picture that was brought to another shape says so by the shape of its pixels, as clients' do (`as_png`).
     """
     try:
-        with PIL.Image.open(BytesIO(body)) as opened:
-            width, height = opened.size
+        with PIL.Image.open(BytesIO(body)) as picture:
+            width, height = picture.size
             # Of a TIFF the size is upright already, and of a PNG without it every pixel would be read first.
-            has_exif = opened.format != "TIFF" and (opened.format != "PNG" or "exif" in opened.info)
-            is_lying = has_exif and opened.getexif().get(_EXIF_ORIENTATION) in _LYING
-            across, along = opened.info.get("aspect") or (1, 1)  # pixels of one length either way, as PNG has it
-            if opened.info.get("jfif_unit") == 0:
-                across, along = opened.info["jfif_density"]
+            has_exif = picture.format != "TIFF" and (picture.format != "PNG" or "exif" in picture.info)
+            is_lying = has_exif and picture.getexif().get(_EXIF_ORIENTATION) in _LYING
+            density_x, density_y = picture.info.get("aspect") or (1, 1)  # pixels a unit of length, as PNG has it
+            if picture.info.get("jfif_unit") == 0:
+                density_x, density_y = picture.info["jfif_density"]
     except Exception:  # Pillow raises a dozen kinds
         return None
-    if across > 0 and along > 0 and across != along:
-        width = max(1, round(width * along / across))
+    if density_x > 0 and density_y > 0 and density_x != density_y:
+        width = max(1, round(width * density_y / density_x))
     return (height, width) if is_lying else (width, height)
 
 
@@ -131,9 +131,9 @@ def thumbnail(body: bytes, max_pixels: int, high: int = THUMBNAIL_HEIGHT) -> byt
 
 
 def is_blank(image: Image) -> bool:
-    """Whether an image shows nothing: it is of one grey but for noise, be that a sensor's in the dark or all there is.
+    """Whether an image shows nothing: it is of one grey, or of noise.
 
-    Of scenes much remains in the means of 8 x 8 fields, of noise, whose grains are small, next to nothing.
+    The means of 8 x 8 fields keep much of a scene's variation, and next to none of noise, whose grains are small.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     deviation = float(grey.std())
@@ -142,7 +142,7 @@ def is_blank(image: Image) -> bool:
 
 
 def _of_jpeg(picture: bytes) -> Image | None:
-    """OpenCV's pixels by the same library, through a binding that hears its warnings: what is missing is grey else."""
+    """Decode by OpenCV's library, through a binding that reports warnings: OpenCV shows missing parts as grey."""
     try:
         return np.asarray(simplejpeg.decode_jpeg(picture, "BGR"), np.uint8)
     except ValueError as error:
@@ -155,13 +155,13 @@ def _of_jpeg(picture: bytes) -> Image | None:
 
 
 def _without_filling(picture: bytes) -> bytes:
-    """A JPEG without the zeros by which some cameras fill up its last scan."""
+    """A JPEG without the zeros with which some cameras fill up its last scan."""
     scan, end = picture[:-2].rstrip(b"\0"), picture[-2:]
     return scan + (b"\0" if scan.endswith(b"\xff") else b"") + end
 
 
 def _reduced(image: NDArray[Any]) -> NDArray[Any]:
-    """Means of squares, of the least whole side that leaves no more than may be kept; usual images as they are."""
+    """An image of at most `KEPT_PIXELS` as it is; a larger one by the means of squares, of the least whole side."""
     height, width = image.shape[:2]
     side = math.ceil(math.sqrt(height * width / KEPT_PIXELS))
     if side == 1:
@@ -170,7 +170,7 @@ def _reduced(image: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-VIEWS_A_LANDMARK = 8  # the first half only moved, the second relit too
+VIEWS_A_LANDMARK = 8  # the first half only warped, the second relit too
 _LONGEST_SIDE = 512  # more pixels than any extractor looks at
 _LEAST_ZOOM = 0.8  # share of the picture's sides that a crop keeps
 _TURN_DEG = 3.0
@@ -182,22 +182,22 @@ _BRIGHTNESS, _NOISE, _BLUR = 40.0, 10.0, 1.5  # grey levels; grey levels; pixels
 def augmented(image: Image, seed: int) -> list[Image]:
     """Views of one picture: what another day, another light or a robot a little aside would show of the place.
 
-    Each at the picture's own size or, of a large one, at a smaller one of the same aspect. No change of geometry is
+    Views have the picture's own size or, of a large one, a smaller one of the same aspect. No change of geometry is
     larger than what a robot sees within a metre or two; light, contrast and colour change as far as seasons do. The
-    same seed gives the same views. The first half of them is moved and not relit, so that what is learnt from these can
-    be judged on the others: with one season known, another light has to stand for the season to come.
+    same seed gives the same views. The first half of them is warped and not relit, so that what is learnt from these
+    can be judged on the others: with one season known, another light has to stand for the season to come.
     """
     rng = np.random.default_rng([seed, 0xA06])
     height, width = image.shape[:2]
     factor = min(1.0, _LONGEST_SIDE / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
     small = image if factor == 1.0 else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    moved = [_moved(small, rng) for _ in range(VIEWS_A_LANDMARK)]
-    return [*moved[: VIEWS_A_LANDMARK // 2], *(_relit(each, rng) for each in moved[VIEWS_A_LANDMARK // 2 :])]
+    warped = [_warp(small, rng) for _ in range(VIEWS_A_LANDMARK)]
+    return [*warped[: VIEWS_A_LANDMARK // 2], *(_relight(view, rng) for view in warped[VIEWS_A_LANDMARK // 2 :])]
 
 
-def _moved(image: Image, rng: np.random.Generator) -> Image:
-    """Zoomed in, shifted within what a crop leaves, turned and stretched a little; the rim repeats."""
+def _warp(image: Image, rng: np.random.Generator) -> Image:
+    """Zoom in, shift within what a crop leaves, turn and stretch a little; the rim is repeated."""
     height, width = image.shape[:2]
     zoom = 1 / rng.uniform(_LEAST_ZOOM, 1.0)
     stretch = float(np.exp(rng.uniform(-_STRETCH, _STRETCH) / 2))
@@ -206,18 +206,18 @@ def _moved(image: Image, rng: np.random.Generator) -> Image:
     matrix = zoom * np.diag([stretch, 1 / stretch]) @ turn
     centre = np.array([width, height]) / 2
     shift = rng.uniform(-0.5, 0.5, 2) * (zoom - 1) * np.array([width, height])
-    moved = cv2.warpAffine(
+    warped = cv2.warpAffine(
         image,
         np.column_stack([matrix, centre - matrix @ centre + shift]),
         (width, height),
         flags=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return np.asarray(moved, np.uint8)
+    return np.asarray(warped, np.uint8)
 
 
-def _relit(image: Image, rng: np.random.Generator) -> Image:
-    """By another light and another lens: gamma, contrast, brightness and tint by one table a channel; blur, noise."""
+def _relight(image: Image, rng: np.random.Generator) -> Image:
+    """Change gamma, contrast, brightness and tint by one table a channel; then add blur and noise."""
     levels = np.linspace(0, 1, 256) ** np.exp(rng.uniform(-_GAMMA, _GAMMA)) * 255
     levels = (levels - 128) * np.exp(rng.uniform(-_CONTRAST, _CONTRAST)) + 128 + rng.uniform(-_BRIGHTNESS, _BRIGHTNESS)
     tables = levels[:, np.newaxis] * np.exp(rng.uniform(-_TINT, _TINT, 3))

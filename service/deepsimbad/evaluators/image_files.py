@@ -1,7 +1,7 @@
 """Files of images, walked from one end to the other before a decoder sees them: JPEG, PNG, TIFF and WebP.
 
-Decoders allocate what a header asks for, unpack what a file brings and half decode a truncated one without a word. Why
-by hand: docs/decisions/0005-libraries.md.
+Decoders allocate what a header asks for, unpack what a file brings and half decode a truncated one without a warning.
+Why no library does this: docs/decisions/0005-libraries.md.
 """
 
 import re
@@ -46,12 +46,12 @@ class ImageFile:
     media_type: str
     picture: bytes  # the file, without what a decoder need not see
     n_pixels: int  # of the largest surface that its header makes a decoder allocate
-    orientation: int = 1  # as a JPEG's Exif gives it; what else a file says of it its decoder obeys
+    orientation: int = 1  # as a JPEG's Exif gives it; other files' decoders apply it themselves
     bits: int = 8  # a channel
 
     @classmethod
     def read(cls, body: bytes, max_pixels: int) -> "ImageFile":
-        """Look at a file from one end to the other; what it is stands in its first bytes, whatever it was called.
+        """Look at a file from one end to the other; its first bytes say what it is, whatever its name.
 
         Raises:
             EmptyBodyError: No bytes.
@@ -91,79 +91,79 @@ def _unpack(form: str, body: bytes, offset: int) -> tuple[Any, ...]:
     return struct.unpack_from(form, body, offset)
 
 
-def _damaged(why: str) -> NoReturn:
-    raise InvalidImageError(f"the image file is damaged: {why}")
+def _damaged(reason: str) -> NoReturn:
+    raise InvalidImageError(f"the image file is damaged: {reason}")
 
 
 def _jpeg(body: bytes, max_pixels: int) -> tuple[bytes, int, int]:
     """Segments of (FF, marker, length, content); after SOS, entropy-coded data to the next marker; EOI last.
 
-    What follows the end (a film, a map of depths) is left away. A file that was cut and closed by an end lacks scans,
-    or has one that its decoder finds short.
+    What follows the end (a film, a map of depths) is left out. A file that was cut and closed by an end lacks scans, or
+    has one that its decoder finds short.
     """
     n_frames, n_scans, n_pixels, orientation, end = 0, 0, 0, 1, 2
-    sent: dict[int, int] = {}  # by component, a bit for each coefficient of a block whose last bit was sent
-    for marker, at, end in _jpeg_segments(body):
+    complete_bits: dict[int, int] = {}  # by component, a bit for each coefficient of a block that is complete
+    for marker, start, end in _jpeg_segments(body):
         if marker in _JPEG_FRAMES:
             n_frames += 1
-            _, height, width, n_components = _unpack(">BHHB", body, at)
+            _, height, width, n_components = _unpack(">BHHB", body, start)
             n_pixels = _n_pixels(width, height, max_pixels)
             n_components = min(n_components, _JPEG_MAX_COMPONENTS)  # a decoder refuses more
-            sent = dict.fromkeys(_unpack("B2x" * n_components, body, at + 6), 0)
+            complete_bits = dict.fromkeys(_unpack("B2x" * n_components, body, start + 6), 0)
         elif marker == _JPEG_SCAN:
             n_scans += 1
-            _note_scan(body[at:end], sent)
-        elif marker == _JPEG_EXIF and body.startswith(_EXIF, at):
-            orientation = _exif_orientation(body[at + len(_EXIF) : end])
+            _note_scan(body[start:end], complete_bits)
+        elif marker == _JPEG_EXIF and body.startswith(_EXIF, start):
+            orientation = _exif_orientation(body[start + len(_EXIF) : end])
         if n_frames > 1 or n_scans > _JPEG_MAX_SCANS or n_scans * n_pixels > _JPEG_MAX_SCANNED:
             _damaged(f"it has {n_frames} frames and {n_scans} scans")
     if n_frames == 0 or n_scans == 0:
         _damaged("it has no picture")
-    if any(coefficients != _ALL_COEFFICIENTS for coefficients in sent.values()):
+    if any(coefficients != _ALL_COEFFICIENTS for coefficients in complete_bits.values()):
         truncated()
     return body[:end], n_pixels, orientation
 
 
 def _jpeg_segments(body: bytes) -> Iterator[tuple[int, int, int]]:
-    """(marker, start and end of its content) one after another, the picture's end last."""
-    at, is_scanned = 2, False
+    """Yield (marker, start and end of its content) of the segments in order, the picture's end last."""
+    offset, is_scanned = 2, False
     for _ in range(_MAX_PARTS):
-        if not is_scanned and at < len(body) and body[at] != 0xFF:
+        if not is_scanned and offset < len(body) and body[offset] != 0xFF:
             _damaged("no marker where one must be")
-        marked = _JPEG_MARKER.search(body, at)
-        if marked is None:
+        match = _JPEG_MARKER.search(body, offset)
+        if match is None:
             truncated()
-        marker, at = marked[0][1], marked.end()
+        marker, offset = match[0][1], match.end()
         if marker == _JPEG_END:
-            yield marker, at, at
+            yield marker, offset, offset
             return
         if marker in {_JPEG_START, 0x01}:
             continue
-        (length,) = _unpack(">H", body, at)
+        (length,) = _unpack(">H", body, offset)
         if length < 2:
             _damaged("a segment shorter than its own length")
-        if at + length > len(body):
+        if offset + length > len(body):
             truncated()
-        yield marker, at + 2, at + length
+        yield marker, offset + 2, offset + length
         is_scanned |= marker == _JPEG_SCAN
-        at += length
+        offset += length
     _damaged(f"it has more than {_MAX_PARTS} parts")
 
 
-def _note_scan(described: bytes, sent: dict[int, int]) -> None:
+def _note_scan(header: bytes, complete_bits: dict[int, int]) -> None:
     """Note which coefficients of which components a scan completes."""
-    n_components = described[0] if described else 0
-    if n_components == 0 or len(described) < 4 + 2 * n_components:
+    n_components = header[0] if header else 0
+    if n_components == 0 or len(header) < 4 + 2 * n_components:
         _damaged("a scan that does not say what it holds")
-    first, last, bits = described[1 + 2 * n_components : 4 + 2 * n_components]
+    first, last, bits = header[1 + 2 * n_components : 4 + 2 * n_components]
     if first <= last <= 63 and bits & 0x0F == 0:  # else a progressive file's lower bits are still to come
-        for component in described[1 : 1 + 2 * n_components : 2]:
-            if component in sent:
-                sent[component] |= (2 << last) - (1 << first)
+        for component in header[1 : 1 + 2 * n_components : 2]:
+            if component in complete_bits:
+                complete_bits[component] |= (2 << last) - (1 << first)
 
 
 def _exif_orientation(exif: bytes) -> int:
-    """1..8 as Exif counts them, a TIFF's first directory; what cannot be read says nothing, as decoders see it."""
+    """1..8 as Exif counts orientations, from its TIFF's first directory; 1 where it cannot be read, as for decoders."""
     try:
         (orientation,) = _tiff_fields(exif)[_TIFF_ORIENTATION]
     except (InvalidImageError, KeyError, ValueError):
@@ -174,26 +174,26 @@ def _exif_orientation(exif: bytes) -> int:
 def _png(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
     """Signature, then chunks of (length, name, content, checksum); IHDR first, IEND last.
 
-    Texts, colour profiles and further frames are left away: the decoder would unpack them, and complain of damaged ones
+    Texts, colour profiles and further frames are left out: the decoder would unpack them, and complain of damaged ones
     on standard error.
     """
     length, name, width, height, bits, colour = _unpack(">I4sIIBB", body, len(_PNG_SIGNATURE))
     if name != b"IHDR" or length != 13:
         _damaged("it does not begin with its header")
     n_pixels = _n_pixels(width, height, max_pixels)
-    view, at = memoryview(body), len(_PNG_SIGNATURE)
-    packed, picture = [], [view[:at]]
+    view, start = memoryview(body), len(_PNG_SIGNATURE)
+    packed, picture = [], [view[:start]]
     for _ in range(_MAX_PARTS):
-        (length,) = _unpack(">I", body, at)
-        name, end = body[at + 4 : at + 8], at + 12 + length
+        (length,) = _unpack(">I", body, start)
+        name, end = body[start + 4 : start + 8], start + 12 + length
         (checksum,) = _unpack(">I", body, end - 4)
-        if zlib.crc32(view[at + 4 : end - 4]) != checksum:
+        if zlib.crc32(view[start + 4 : end - 4]) != checksum:
             _damaged("a checksum does not fit")
         if name in _PNG_PICTURE:
-            picture.append(view[at:end])
+            picture.append(view[start:end])
         if name == b"IDAT":
-            packed.append(view[at + 8 : end - 4])
-        at = end
+            packed.append(view[start + 8 : end - 4])
+        start = end
         if name == b"IEND":
             break
     else:
@@ -203,8 +203,8 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
     return b"".join(picture), n_pixels, 1, bits
 
 
-def _check_unpacks(packed: list[memoryview], most: int) -> None:
-    """Refuse picture data of a PNG that unpack to far more than its pixels: a decoder would unpack it all."""
+def _check_unpacks(packed: list[memoryview], limit_bytes: int) -> None:
+    """Refuse a PNG whose picture data unpacks to far more than its pixels: a decoder would unpack it all."""
     if sum(map(len, packed)) <= _PNG_UNPACKED:
         return
     unpacker, n_bytes = zlib.decompressobj(), 0
@@ -214,7 +214,7 @@ def _check_unpacks(packed: list[memoryview], most: int) -> None:
             while len(rest) > 0 and not unpacker.eof:
                 n_bytes += len(unpacker.decompress(rest, 1 << 20))
                 rest = unpacker.unconsumed_tail
-                if n_bytes > most:
+                if n_bytes > limit_bytes:
                     _damaged("it unpacks to more than the pixels that its header claims")
     except zlib.error as error:
         raise InvalidImageError("the image file is damaged: its picture cannot be unpacked") from error
@@ -247,10 +247,10 @@ def _tiff_fields(body: bytes) -> dict[int, tuple[int, ...]]:
     (version,) = _unpack(order + "H", body, 2)
     is_big = version == 43
     number, n_value_bytes = ("Q", 8) if is_big else ("I", 4)
-    (at,) = _unpack(order + number, body, 8 if is_big else 4)
+    (directory,) = _unpack(order + number, body, 8 if is_big else 4)
     n_form = order + ("Q" if is_big else "H")
-    (n_fields,) = _unpack(n_form, body, at)
-    first, entry_bytes = at + struct.calcsize(n_form), 4 + 2 * n_value_bytes
+    (n_fields,) = _unpack(n_form, body, directory)
+    first, entry_bytes = directory + struct.calcsize(n_form), 4 + 2 * n_value_bytes
     if n_fields > _MAX_PARTS:
         _damaged(f"it has more than {_MAX_PARTS} parts")
     fields: dict[int, tuple[int, ...]] = {}

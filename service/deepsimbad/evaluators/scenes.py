@@ -1,4 +1,4 @@
-"""What is told of a scene beside its image, or in its place: the objects that a detector finds, a text.
+"""Forms of an observation beside its image, or in its place: the objects that a detector finds, a text.
 
 A label is any word; a box is left, top, right, bottom in shares of the image's sides; a text is of any length that a
 person would speak.
@@ -39,7 +39,7 @@ _OTHERS = ("application/json", RANKS, UNIT_ENCODING)  # that every domain takes
 
 @dataclass(frozen=True)
 class Objects:
-    """What a detector finds in an image, in any order."""
+    """The objects that a detector finds in an image, in any order."""
 
     labels: tuple[str, ...]
     boxes: NDArray[np.float64]  # [n, 4] left, top, right, bottom, 0..1
@@ -47,14 +47,14 @@ class Objects:
 
     @classmethod
     def read(cls, raw: Any) -> Self:
-        """Of a JSON list of {"label", "box", "score"}, a score of 1 where none is said; raises InvalidSceneError."""
+        """From a JSON list of {"label", "box", "score"}, a score of 1 where none is given; raises InvalidSceneError."""
         if not isinstance(raw, Sequence) or isinstance(raw, str):
             raise InvalidSceneError('objects is a list of {"label": "car", "box": [x0, y0, x1, y1], "score": 0.9}')
         if len(raw) > MOST_OBJECTS:
             raise InvalidSceneError(
                 f"{len(raw)} objects: send the {MOST_OBJECTS} of highest score", most_objects=MOST_OBJECTS
             )
-        rows = [_checked(number, each) for number, each in enumerate(raw)]
+        rows = [_checked(number, member) for number, member in enumerate(raw)]
         boxes = np.array([row[1] for row in rows], np.float64).reshape(-1, 4)
         return cls(tuple(row[0] for row in rows), boxes, np.array([row[2] for row in rows], np.float64))
 
@@ -86,7 +86,7 @@ def _is_share(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Scene:
-    """One observation by its forms; None: not told."""
+    """One observation by its forms; None: it lacks this one."""
 
     image: Image | None = None
     objects: Objects | None = None
@@ -94,7 +94,7 @@ class Scene:
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Self:
-        """Of JSON members `objects` and `text`, one at least; raises InvalidSceneError."""
+        """From JSON members `objects` and `text`, one at least; raises InvalidSceneError."""
         text, objects = document.get("text"), document.get("objects")
         if text is None and objects is None:
             raise InvalidSceneError("nothing is told: give objects, text, or both")
@@ -108,7 +108,7 @@ class Scene:
 
     @classmethod
     def of_body(cls, body: bytes, media_type: str) -> Self:
-        """Of a body `text/plain`, or else `application/json`; raises InvalidSceneError."""
+        """From a body `text/plain`, or else `application/json`; raises InvalidSceneError."""
         try:
             text = body.decode("utf-8-sig")
             document = {"text": text} if media_type == TEXT else json.loads(text)
@@ -120,76 +120,76 @@ class Scene:
 
     @classmethod
     def of_form(cls, body: bytes) -> tuple[Self, bytes | None]:
-        """Of `multipart/form-data` (RFC 7578), and the image file in it; raises InvalidSceneError."""
+        """From `multipart/form-data` (RFC 7578), and the image file in it; raises InvalidSceneError."""
         delimiter = body.partition(b"\r\n")[0]
         pieces = (b"\r\n" + body).split(b"\r\n" + delimiter)
         if not delimiter.startswith(b"--") or len(pieces) < 3 or not pieces[-1].startswith(b"--"):
             raise InvalidSceneError("this is no whole multipart/form-data: send its parts as curl -F does")
-        told: dict[str, bytes] = {}
+        contents: dict[str, bytes] = {}
         for piece in pieces[1:-1]:
             head, _, content = piece.partition(b"\r\n\r\n")
             name = re.search(rb'\bname="?([a-z]{1,20})\b', head)
             word = "" if name is None else name[1].decode()
-            if word not in set(Form) or word in told:
+            if word not in set(Form) or word in contents:
                 raise InvalidSceneError("the parts of a form are image, objects and text, each once")
-            told[word] = content
+            contents[word] = content
         try:
-            text = told["text"].decode("utf-8-sig") if "text" in told else None
-            objects = json.loads(told["objects"]) if "objects" in told else None
+            text = contents["text"].decode("utf-8-sig") if "text" in contents else None
+            objects = json.loads(contents["objects"]) if "objects" in contents else None
         except (RecursionError, ValueError) as error:
             raise InvalidSceneError("objects is no JSON, or the text no UTF-8") from error
-        scene = cls() if set(told) == {"image"} else cls.read({"text": text, "objects": objects})
-        return scene, told.get("image")
+        scene = cls() if set(contents) == {"image"} else cls.read({"text": text, "objects": objects})
+        return scene, contents.get("image")
 
-    def beside(self, image: Image) -> Self:
+    def with_image(self, image: Image) -> Self:
         """The scene with an image."""
         return replace(self, image=image)
 
     @property
     def forms(self) -> frozenset[Form]:
-        """Those it is told in."""
+        """The forms that it has."""
         return frozenset(form for form in Form if getattr(self, form.value) is not None)
 
     @property
-    def telling(self) -> frozenset[Form]:
-        """Those that tell something: an image may be blank."""
+    def informative_forms(self) -> frozenset[Form]:
+        """The forms that tell something: an image may be blank."""
         return self.forms - ({Form.IMAGE} if self.image is not None and is_blank(self.image) else frozenset())
 
     @property
     def is_blank(self) -> bool:
-        """Whether it tells nothing: no object, and nothing else."""
-        return self.telling <= {Form.OBJECTS} and (self.objects is None or not self.objects.labels)
+        """Whether it has nothing but a blank image and an empty list of objects."""
+        return self.informative_forms <= {Form.OBJECTS} and (self.objects is None or not self.objects.labels)
 
-    def of(self, taken: frozenset[Form]) -> Self:
-        """The scene; raises UnsupportedMediaTypeError where it is told in a form that an evaluator does not take."""
-        if others := self.forms - taken:
-            takes = " and ".join(sorted(taken)) or "ready encodings alone"
+    def check_forms(self, accepted: frozenset[Form]) -> Self:
+        """The scene itself; raises UnsupportedMediaTypeError where it has a form that an evaluator does not take."""
+        if excess := self.forms - accepted:
+            takes = " and ".join(sorted(accepted)) or "ready encodings alone"
             allowed = [
-                *(MEDIA_TYPES if Form.IMAGE in taken else ()),
+                *(MEDIA_TYPES if Form.IMAGE in accepted else ()),
                 *_OTHERS,
-                *((TEXT,) if Form.TEXT in taken else ()),
+                *((TEXT,) if Form.TEXT in accepted else ()),
             ]
             raise UnsupportedMediaTypeError(
-                f"this domain takes {takes}, not {' or '.join(sorted(others))}", allowed=allowed
+                f"this domain takes {takes}, not {' or '.join(sorted(excess))}", allowed=allowed
             )
         return self
 
     @property
     def remarks(self) -> list[str]:
-        """What a person should know of it."""
+        """Sentences that a person should read about it."""
         letters = [letter for letter in self.text or "" if letter.isalpha()]
         if letters and sum(letter >= _LATIN_BELOW for letter in letters) > _FOREIGN_SHARE * len(letters):
             return ["the text is of another script than the language model knows best: English finds more"]
         return []
 
 
-def picture_in(seen: Image | Scene) -> Image | None:
+def picture_in(observation: Image | Scene) -> Image | None:
     """The image of an observation."""
-    return seen.image if isinstance(seen, Scene) else seen
+    return observation.image if isinstance(observation, Scene) else observation
 
 
-def seen_in(body: bytes, media_type: str, evaluator: Evaluator, max_pixels: int) -> Image | Scene:
-    """What a body shows or tells, an image at its evaluator's size.
+def read_observation(body: bytes, media_type: str, evaluator: Evaluator, max_pixels: int) -> Image | Scene:
+    """The observation in a body, an image at its evaluator's size.
 
     Raises:
         InvalidImageError, InvalidSceneError: It cannot be read.
@@ -198,19 +198,19 @@ def seen_in(body: bytes, media_type: str, evaluator: Evaluator, max_pixels: int)
     if media_type.startswith("image/"):
         return evaluator.prepare(decode_image(body, max_pixels))
     scene, image = Scene.of_form(body) if media_type.startswith(FORM_DATA) else (Scene.of_body(body, media_type), None)
-    scene.of(evaluator.forms)
-    return scene if image is None else scene.beside(evaluator.prepare(decode_image(image, max_pixels)))
+    scene.check_forms(evaluator.forms)
+    return scene if image is None else scene.with_image(evaluator.prepare(decode_image(image, max_pixels)))
 
 
-def shows_none(seen: Image | Scene) -> bool:
-    """Whether nothing is seen."""
-    return seen.is_blank if isinstance(seen, Scene) else is_blank(seen)
+def shows_none(observation: Image | Scene) -> bool:
+    """Whether an observation is blank."""
+    return observation.is_blank if isinstance(observation, Scene) else is_blank(observation)
 
 
-def check_whole(evaluator: Evaluator, seen: Image | Scene) -> None:
-    """Raise InvalidSceneError where a map's frame is not told in every form that its encoding is made of."""
-    told = seen.forms if isinstance(seen, Scene) else frozenset({Form.IMAGE})
-    if lacking := evaluator.lacking(told):
+def check_whole(evaluator: Evaluator, observation: Image | Scene) -> None:
+    """Raise InvalidSceneError where a map's frame lacks a form that its encoding is made of."""
+    forms = observation.forms if isinstance(observation, Scene) else frozenset({Form.IMAGE})
+    if lacking := evaluator.lacking(forms):
         raise InvalidSceneError(
             f"a frame of a map has every half of its evaluator, and this one lacks {' or '.join(sorted(lacking))}: "
             "send multipart/form-data, or JSON with objects and text",

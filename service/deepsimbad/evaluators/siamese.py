@@ -1,8 +1,8 @@
 """The deep Siamese of the paper (II-A, 1): a pairwise network d(x, p) on what a frozen extractor gives of both.
 
-d = softplus(a linear layer, and a small MLP beside it) of (|x - p|, x * p), of unit vectors x and p. The linear layer
-begins as squared L2 and the MLP as nothing, so training begins at plain L2; the epoch that validates best stays, and
-goes back to plain L2 where it is no better on stretches that nothing was chosen by.
+d = softplus(a linear layer plus a small MLP) of (|x - p|, x * p), of unit vectors x and p. The linear layer begins as
+squared L2 and the MLP as zero, so training begins at plain L2; the arrays of the epoch that validates best are kept, or
+those of plain L2 where the former do no better on stretches used for neither training nor validation.
 """
 
 import time
@@ -19,14 +19,14 @@ from deepsimbad.evaluators.trunk import Axes, PairScores, Split, Trunk, UnitLess
 
 _HIDDEN = 32
 _EPOCHS, _BATCH, _MOST_QUERIES = 40, 64, 2048  # queries: at once, and an epoch
-_HARD, _EASY, _RETRIEVED = 16, 16, 64  # wrong answers a query: of the nearest 64 that retrieval gives, and any
+_HARD, _EASY, _RETRIEVED = 16, 16, 64  # wrong frames a query: drawn from the nearest 64 by L2, and from all
 _RATE, _DECAY = 2e-3, 1e-2
-_SHARPNESS = 10.0  # what a squared L2 of 1 counts in the softmax over dissimilarities, at the beginning
+_SHARPNESS = 10.0  # factor of squared L2 in the dissimilarity before training
 _TRAINED = ("apart", "product", "bias", "out", "linear", "offset")
 
 
 class Siamese(Trunk):
-    """Dissimilarity = a trained network's, of a scene and each landmark: r of them in one pass."""
+    """Dissimilarity = the output of a trained network for a scene and a landmark; all r landmarks in one pass."""
 
     kind = "siamese"
     axes: ClassVar[Axes] = {
@@ -36,17 +36,19 @@ class Siamese(Trunk):
     }  # fmt: skip
 
     def fit(self, lesson: Lesson) -> Fitted:
-        began = time.monotonic()
+        start_s = time.monotonic()
         arrays, units = self.unit_lesson(lesson)
         split = Split.of(units, lesson.seed)
         trained, plain, metrics = _train(units, split, lesson)
         verdict = Verdict.of(self.kind, units, split.test, lambda x: _dissimilarities(x, units.prototypes, trained))
-        kept = trained if verdict.is_better else plain
-        arrays |= {f"{self.kind}_{name}": array for name, array in kept.items()}
+        arrays_kept = trained if verdict.is_better else plain
+        arrays |= {f"{self.kind}_{name}": array for name, array in arrays_kept.items()}
         arrays[f"{self.kind}_landmarks"] = units.prototypes
-        arrays[f"{self.kind}_beside"] = self.beside(lesson, arrays) if verdict.is_better else np.zeros(1, np.float32)
+        arrays[f"{self.kind}_beside"] = (
+            self.dissimilarity_factor(lesson, arrays) if verdict.is_better else np.zeros(1, np.float32)
+        )
         metrics |= {**verdict.scores, "is_l2": not verdict.is_better}
-        metrics |= {"seed": lesson.seed, "seconds": time.monotonic() - began}
+        metrics |= {"seed": lesson.seed, "seconds": time.monotonic() - start_s}
         return Fitted(arrays, metrics, () if verdict.is_better else (no_better(self.kind, verdict),))
 
     def own_dissimilarities(self, encodings: NDArray[np.float32], model: LandmarkModel) -> NDArray[np.float32]:
@@ -58,14 +60,14 @@ class Siamese(Trunk):
 def _dissimilarities(
     x: NDArray[np.float32], p: NDArray[np.float32], trained: Mapping[str, NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """[n, r] of unit vectors [n, k] and [r, k]; a scene at a time, so that company changes nothing."""
-    answer = np.empty((len(x), len(p)), np.float32)
+    """[n, r] dissimilarities of unit vectors [n, k] and [r, k]; a scene at a time, so that none depends on others."""
+    dissimilarities = np.empty((len(x), len(p)), np.float32)
     for row, scene in enumerate(x):
-        apart, product = np.abs(scene - p), scene * p
-        hidden = np.maximum(apart @ trained["apart"] + product @ trained["product"] + trained["bias"], 0)
-        out = hidden @ trained["out"] + apart @ trained["linear"][0] + product @ trained["linear"][1]
-        answer[row] = np.logaddexp(0, out + trained["offset"][0])
-    return answer
+        difference, product = np.abs(scene - p), scene * p
+        hidden = np.maximum(difference @ trained["apart"] + product @ trained["product"] + trained["bias"], 0)
+        out = hidden @ trained["out"] + difference @ trained["linear"][0] + product @ trained["linear"][1]
+        dissimilarities[row] = np.logaddexp(0, out + trained["offset"][0])
+    return dissimilarities
 
 
 _Arrays: TypeAlias = dict[str, NDArray[np.float32]]  # by name
@@ -75,7 +77,7 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
     """The arrays of the best epoch, those of plain L2, and how training went."""
     import torch
 
-    rng, k = np.random.default_rng(lesson.seed), units.own.shape[1]
+    rng, k = np.random.default_rng(lesson.seed), units.drive.shape[1]
     random = torch.Generator().manual_seed(lesson.seed)
     layers: dict[str, Any] = {
         "apart": torch.randn(k, _HIDDEN, generator=random) * k**-0.5,
@@ -87,25 +89,27 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
     }
     start = {name: layer.clone() for name, layer in layers.items()}
     optimiser = torch.optim.Adam([layer.requires_grad_() for layer in layers.values()], _RATE)
-    own, queries, weight = (torch.from_numpy(array) for array in (units.own, units.queries, units.weight))
+    drive, queries, weight = (torch.from_numpy(array) for array in (units.drive, units.queries, units.weight))
     retrieved = _retrieved(units, split)
 
-    def measured(rows: NDArray[np.int64], compared: NDArray[np.int64]) -> Any:
-        """[q, c] of queries to some frames each, as `_dissimilarities` has it."""
-        x, p = queries[rows][:, None], own[compared]
-        apart, product = (x - p).abs(), x * p
-        hidden = torch.relu(apart @ layers["apart"] + product @ layers["product"] + layers["bias"])
-        out = hidden @ layers["out"] + apart @ layers["linear"][0] + product @ layers["linear"][1]
+    def dissimilarities(rows: NDArray[np.int64], frames: NDArray[np.int64]) -> Any:
+        """[q, c] of queries `rows` [q] to `frames` [q, c], as `_dissimilarities` computes them."""
+        x, p = queries[rows][:, None], drive[frames]
+        difference, product = (x - p).abs(), x * p
+        hidden = torch.relu(difference @ layers["apart"] + product @ layers["product"] + layers["bias"])
+        out = hidden @ layers["out"] + difference @ layers["linear"][0] + product @ layers["linear"][1]
         return torch.nn.functional.softplus(out + layers["offset"])
 
-    def batch_loss(some: NDArray[np.int64]) -> Any:
-        """How far the right frame is from being nearest among wrong ones, as a softmax sees it."""
-        rows, n = split.train[some], len(some)
-        hard = np.take_along_axis(retrieved[some], rng.integers(0, retrieved.shape[1], (n, _HARD)), 1)
+    def batch_loss(batch: NDArray[np.int64]) -> Any:
+        """The weighted mean cross-entropy of a softmax over a query's right frame and wrong ones."""
+        rows, n = split.train[batch], len(batch)
+        hard = np.take_along_axis(retrieved[batch], rng.integers(0, retrieved.shape[1], (n, _HARD)), 1)
         true, easy = units.true[rows][:, np.newaxis], rng.choice(split.wrong, (n, _EASY))
-        others = np.concatenate([hard, easy], axis=1)
-        is_none = np.concatenate([np.zeros((n, 1), np.bool_), units.is_near(true, others)], axis=1)
-        d = measured(rows, np.concatenate([true, others], axis=1)).masked_fill(torch.from_numpy(is_none), torch.inf)
+        wrong_frames = np.concatenate([hard, easy], axis=1)
+        is_barred = np.concatenate([np.zeros((n, 1), np.bool_), units.is_near(true, wrong_frames)], axis=1)
+        d = dissimilarities(rows, np.concatenate([true, wrong_frames], axis=1)).masked_fill(
+            torch.from_numpy(is_barred), torch.inf
+        )
         return (-torch.log_softmax(-d, 1)[:, 0] * weight[rows]).mean()
 
     curve: list[dict[str, Any]] = []
@@ -123,11 +127,11 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
             (loss + _DECAY * drift / len(split.train)).backward()
             optimiser.step()
             losses.append(float(loss.detach()))
-        now = {name: layer.detach().numpy().astype(np.float16).astype(np.float32) for name, layer in layers.items()}
-        scores = PairScores.of(units, split.validation, partial(_dissimilarities, p=units.prototypes, trained=now))
-        plain = plain or now
+        arrays = {name: layer.detach().numpy().astype(np.float16).astype(np.float32) for name, layer in layers.items()}
+        scores = PairScores.of(units, split.validation, partial(_dissimilarities, p=units.prototypes, trained=arrays))
+        plain = plain or arrays
         if not best or scores.anr < min(point["anr"] for point in curve):
-            best = now
+            best = arrays
         curve.append({"epoch": epoch, "loss": float(np.mean(losses)) if losses else None, "anr": scores.anr})
         n_evaluated += len(order) * (1 + _HARD + _EASY) + scores.ranks.size * len(units.landmarks)
     lesson.on_progress(1.0)
@@ -136,12 +140,12 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
 
 
 def _retrieved(units: UnitLesson, split: Split) -> NDArray[np.int64]:
-    """[q, 64] the frames that plain L2 places nearest to each query of training, but for those of its own place."""
+    """[q, 64] the frames that plain L2 places nearest to each query of training, without those of its own place."""
     n = min(_RETRIEVED, len(split.wrong))
     nearest = np.empty((len(split.train), n), np.int64)
     for first in range(0, len(split.train), 1024):
         rows = split.train[first : first + 1024]
-        apart = squared_between(units.queries[rows], units.own[split.wrong])
-        apart[units.is_near(units.true[rows][:, np.newaxis], split.wrong)] = np.inf
-        nearest[first : first + 1024] = split.wrong[np.argpartition(apart, n - 1, axis=1)[:, :n]]
+        dissimilarities = squared_between(units.queries[rows], units.drive[split.wrong])
+        dissimilarities[units.is_near(units.true[rows][:, np.newaxis], split.wrong)] = np.inf
+        nearest[first : first + 1024] = split.wrong[np.argpartition(dissimilarities, n - 1, axis=1)[:, :n]]
     return nearest

@@ -24,8 +24,8 @@ from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidSceneError, InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Fitted, Image, LandmarkModel
 from deepsimbad.evaluators.image import picture_size
-from deepsimbad.evaluators.scenes import Scene, check_whole, seen_in, shows_none
-from deepsimbad.evaluators.space import seen
+from deepsimbad.evaluators.scenes import Scene, check_whole, read_observation, shows_none
+from deepsimbad.evaluators.space import dissimilarities_and_vectors
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
 from deepsimbad_client.http import text_of
@@ -154,7 +154,7 @@ def encode_block(
                 broken[place] = error.reason
             else:
                 try:
-                    waiting[row] = seen_in(body.body, body.content_type, evaluator, max_pixels)
+                    waiting[row] = read_observation(body.body, body.content_type, evaluator, max_pixels)
                     check_whole(evaluator, waiting[row])
                 except InvalidSceneError as error:
                     raise InvalidSceneError(f"{frame.name}: {error.message}", **error.hints) from error
@@ -228,7 +228,7 @@ def measured(
     blocks, vectors, is_otherwise_told = [], [], False
     for start in range(0, drive.n_frames, _FRAMES_A_BLOCK):
         encodings = drive.encodings[start : start + _FRAMES_A_BLOCK]
-        dissimilarities, compared = seen(evaluator, encodings, model)
+        dissimilarities, compared = dissimilarities_and_vectors(evaluator, encodings, model)
         blocks.append(dissimilarities)
         vectors.append(compared)
         is_otherwise_told = is_otherwise_told or compared is not encodings
@@ -334,7 +334,7 @@ def compared(drive: Drive, model: LandmarkModel, evaluator: Evaluator) -> Drive:
     if evaluator.is_squared_l2:
         return drive
     starts = range(0, drive.n_frames, _FRAMES_A_BLOCK)
-    blocks = [evaluator.compared(drive.encodings[start : start + _FRAMES_A_BLOCK], model) for start in starts]
+    blocks = [evaluator.comparison_vectors(drive.encodings[start : start + _FRAMES_A_BLOCK], model) for start in starts]
     return drive.standing_for(np.concatenate(blocks))
 
 

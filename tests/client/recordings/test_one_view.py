@@ -13,7 +13,7 @@ from PIL import Image as Pillow
 
 from deepsimbad.cli import run as run_service
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.grey_levels import measured
+from deepsimbad.evaluators.grey_levels import measured_levels
 from deepsimbad.evaluators.image import decode_image, is_blank, resized
 from deepsimbad_client import Client
 from deepsimbad_client.commands import run
@@ -216,7 +216,7 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, caps
             httpx2.put(f"{frame}/{place}?position_m={place}", content=body, headers=header).raise_for_status()
         raw = client.admin.traverse("yard", "raw")
         assert raw.n_uninformative == 1
-        assert raw.grey_levels == measured([cv2.imread(str(drive / "00.png"), cv2.IMREAD_UNCHANGED)])
+        assert raw.grey_levels == measured_levels([cv2.imread(str(drive / "00.png"), cv2.IMREAD_UNCHANGED)])
         with pytest.raises(InvalidInputError, match="black and white"):
             client.admin.create_traverse("yard", "odd", grey_levels=(9, 9))
     assert run_service(["localize", "yard", str(look), "--data-dir", data_dir, "--json"]) == 0

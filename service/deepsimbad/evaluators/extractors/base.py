@@ -1,4 +1,4 @@
-"""What an extractor is, and one whose work is a network's: images are brought to its size, then computed in batches."""
+"""What an extractor is, and one that runs a network: images are brought to its size, then computed in batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.runtimes import Run
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of red, green and blue from 0 to 1, by which most pretrained networks want their images."""
+"""Of red, green and blue from 0 to 1; most pretrained networks take images standardised by them."""
 
 _LONGEST_SIDE = 1024  # pixels, where images keep their aspect; larger ones are reduced
 
@@ -37,7 +37,7 @@ class Extractor(Protocol):
         """How many images are best encoded at once here; more only take more memory."""
 
     def prepare(self, image: Image) -> Image:
-        """Bring an image to the size it is encoded at; one that is there already comes back as it is."""
+        """Bring an image to the size it is encoded at; one that has it already comes back as it is."""
 
     def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
         """Encode images.
@@ -56,13 +56,13 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True)
 class NetworkExtractor:
-    """An extractor whose work is a network's."""
+    """An extractor that runs a network."""
 
-    run: Run  # the network, ready
+    run: Run  # the network
     encoding_dim: int  # d
     weights_sha256: str | None  # as `encodings_sha256` gives it
     input_size: tuple[int, int] | None  # (width, height) every image is brought to; None: they keep their aspect
-    shortest_side: int = 1  # of those, in pixels; smaller ones are enlarged
+    shortest_side: int = 1  # pixels, of images that keep their aspect; shorter sides are enlarged
 
     @property
     def largest_batch(self) -> int:
@@ -93,6 +93,6 @@ class NetworkExtractor:
 
 
 def in_pixels(shares: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Of three channels from 0 to 1, as pixels from 0 to 255 have it."""
+    """Three channels from 0 to 1 on the scale of pixels, 0 to 255."""
     red, green, blue = shares
     return red * 255, green * 255, blue * 255

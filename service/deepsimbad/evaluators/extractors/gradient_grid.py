@@ -43,7 +43,7 @@ class GradientGrid:
     largest_batch = 1
 
     def prepare(self, image: Image) -> Image:
-        """See `Extractor`; colours go, of which it sees nothing."""
+        """See `Extractor`; the image becomes grey, since colours are not encoded."""
         grey = cv2.cvtColor(resized(image, self.input_size), cv2.COLOR_BGR2GRAY)
         return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
 
@@ -64,8 +64,8 @@ def _encoding(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
     energy = _cells(_directional_energy(_normalised(grey)))
     folded = energy[..., : _DIRECTIONS // 2] + energy[..., _DIRECTIONS // 2 :]
     strength = np.sqrt(np.square(folded).sum(axis=2))
-    around = cv2.GaussianBlur(strength, (0, 0), sigmaX=_NEIGHBOURHOOD[0], sigmaY=_NEIGHBOURHOOD[1])
-    shares = 1.0 / (around[..., None] + _FLOOR)
+    surroundings = cv2.GaussianBlur(strength, (0, 0), sigmaX=_NEIGHBOURHOOD[0], sigmaY=_NEIGHBOURHOOD[1])
+    shares = 1.0 / (surroundings[..., None] + _FLOOR)
     signed, unsigned = _unit((energy * shares) ** _POWER), _unit((folded * shares) ** _POWER)
     return _unit(np.concatenate([signed, unsigned]))
 
@@ -99,7 +99,7 @@ def _cells(energy: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _unit(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Flat and of length 1; of nothing (a uniform image), the vector that favours no element."""
+    """Flat and of length 1; for zeros (a uniform image), the vector of equal elements."""
     flat = values.ravel()
     length = float(np.linalg.norm(flat))
     if length < 1e-6:

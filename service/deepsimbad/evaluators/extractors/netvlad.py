@@ -1,9 +1,9 @@
 """NetVLAD, the encodings of the paper's own system (II-A), from a file of public weights of any known family.
 
-A whitening applied to a vector in the wrong order, or pixels normalised as another family's, give no error and noise;
-so the family is recognised from what a file holds, never told, and its order, normalisation and size come with it.
-Which names, orders and constants: the sources that wrote the files (hloc and netvlad_tf_open, pytorch-NetVlad,
-Patch-NetVLAD, OpenIBL).
+A whitening applied to a vector in the wrong order, or pixels normalised as another family's, give noise and no error;
+so the family is recognised from what a file holds, and its order, normalisation and size come with it. Names, orders
+and constants are those of the sources that wrote the files (hloc and netvlad_tf_open, pytorch-NetVlad, Patch-NetVLAD,
+OpenIBL).
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,12 +42,12 @@ def netvlad(file: str, compute: Compute) -> NetworkExtractor:
 
 @dataclass(frozen=True)
 class Preset:
-    """What goes with the weights of a family."""
+    """How images are prepared for the weights of a family, and in which order their vectors lie."""
 
     family: str  # its name
     cluster_major: bool  # see `NetVlad`
-    mean: tuple[float, float, float] | None  # of RGB, of pixels 0..255, taken away from them; None: the file holds it
-    deviation: tuple[float, float, float]  # what they are then divided by
+    mean: tuple[float, float, float] | None  # RGB, subtracted from pixels 0..255; None: the file holds it
+    deviation: tuple[float, float, float]  # RGB, divisor of the rest
     input_size: tuple[int, int] | None  # (width, height) in pixels; None: the aspect is kept
 
 
@@ -87,7 +87,6 @@ class NetVladWeights:
 
     @property
     def encoding_dim(self) -> int:
-        """d."""
         whitening = self.tensors.get("whitening.bias")
         return self.tensors["centres"].numel() if whitening is None else len(whitening)
 
@@ -110,11 +109,11 @@ def read_netvlad(path: Path) -> NetVladWeights:
 
 def _of_checkpoint(path: Path) -> NetVladWeights:
     content = load_checkpoint(path)
-    named = content.get("state_dict", content) if isinstance(content, Mapping) else None
-    if not isinstance(named, Mapping):
+    entries = content.get("state_dict", content) if isinstance(content, Mapping) else None
+    if not isinstance(entries, Mapping):
         raise InvalidWeightsError(f"{path.name} holds no weights by name", file=path.name)
     # Networks trained on several devices have `.module.` in their names.
-    tensors = {".".join(part for part in str(name).split(".") if part != "module"): t for name, t in named.items()}
+    tensors = {".".join(part for part in str(name).split(".") if part != "module"): t for name, t in entries.items()}
     for preset, names in _CHECKPOINTS:
         if names.centres in tensors and (names.whitening is None or f"{names.whitening}.weight" in tensors):
             return _renamed(preset, names, tensors, path.name)
@@ -123,7 +122,7 @@ def _of_checkpoint(path: Path) -> NetVladWeights:
 
 
 def _renamed(preset: Preset, names: _Names, tensors: Mapping[str, Any], file: str) -> NetVladWeights:
-    """By our names. What the family does not have is refused: it would be of a network that computes more."""
+    """The tensors under the names of `NetVlad`; others than the family's are refused, as another network's."""
     origins = {
         f"trunk.convolutions.{number}.{kind}": f"{names.trunk.format(layer)}.{kind}"
         for number, layer in enumerate(_LAYERS)
@@ -137,22 +136,26 @@ def _renamed(preset: Preset, names: _Names, tensors: Mapping[str, Any], file: st
             f"{file} looks like the family {preset.family} and also has {unknown[0]}: it is of another network",
             file=file, unknown=unknown[:10],
         )  # fmt: skip
-    checked = {ours: _checked(tensors.get(theirs), theirs, file) for ours, theirs in origins.items()}
+    checked = {our_name: _checked(tensors.get(origin), origin, file) for our_name, origin in origins.items()}
     for name in ("assignment", "whitening.weight"):  # convolutions of 1 x 1 there, products of matrices here
         if name in checked and checked[name].ndim == 4:
             checked[name] = checked[name].flatten(1)
     return NetVladWeights(preset, checked | _colours(preset.mean, preset), file)
 
 
-def _checked(given: Any, name: str, file: str) -> Tensor:
+def _checked(tensor: Any, name: str, file: str) -> Tensor:
     """A tensor whose numbers all lie in the file: shapes may not claim more than was read."""
-    if not isinstance(given, Tensor) or given.layout is not torch.strided or not given.is_floating_point():
+    if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or not tensor.is_floating_point():
         raise InvalidWeightsError(f"{file} has no {name} of floating-point numbers", file=file, missing=name)
-    if given.ndim == 0 or given.numel() == 0 or given.numel() * given.element_size() > given.untyped_storage().nbytes():
+    if (
+        tensor.ndim == 0
+        or tensor.numel() == 0
+        or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes()
+    ):
         raise InvalidWeightsError(
-            f"{file} has {name} of shape {list(given.shape)}, which cannot be", file=file, name=name
+            f"{file} has {name} of shape {list(tensor.shape)}, which cannot be", file=file, name=name
         )
-    return given.float().contiguous()
+    return tensor.float().contiguous()
 
 
 def _colours(mean: Sequence[float] | None, preset: Preset) -> dict[str, Tensor]:

@@ -1,8 +1,8 @@
 """Any model in an ONNX file, run by ONNX Runtime on the processor.
 
-What it is shown is told by the file itself: its input's shape and, where it was not trained as models of ImageNet are,
-entries of its metadata (`metadata_props`). `deepsimbad.scale` is what pixels 0..255 are multiplied by first, then
-`deepsimbad.mean` is taken off and the rest divided by `deepsimbad.std`: one number or three, in the order of
+The file itself says how images are prepared: by its input's shape and, where it was not trained as models of ImageNet
+are, by entries of its metadata (`metadata_props`). Pixels 0..255 are multiplied by `deepsimbad.scale`, then
+`deepsimbad.mean` is subtracted and the rest divided by `deepsimbad.std`: one number or three, in the order of
 `deepsimbad.channels`, RGB or BGR. `deepsimbad.layout` is NCHW or NHWC. Numbers are written as JSON.
 """
 
@@ -47,22 +47,22 @@ def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
         raise InvalidWeightsError(f"{argument} is larger than an ONNX file can be", file=argument)
     run = _FileRun(argument, path.read_bytes(), compute)
     width, height = run.input_size
-    given = run(np.zeros((1, height, width, 3), np.uint8))
-    return NetworkExtractor(run, given.shape[1], encodings_sha256(sha256, _RECIPE), run.input_size)
+    encodings = run(np.zeros((1, height, width, 3), np.uint8))
+    return NetworkExtractor(run, encodings.shape[1], encodings_sha256(sha256, _RECIPE), run.input_size)
 
 
 @dataclass(frozen=True)
-class _Shown:
-    """How a file wants its images."""
+class _InputForm:
+    """How a file's model takes images."""
 
-    scale: NDArray[np.float32]  # [3] float32, what pixels are multiplied by first
-    mean: NDArray[np.float32]  # [3] float32, taken off then
-    std: NDArray[np.float32]  # [3] float32, what the rest is divided by
+    scale: NDArray[np.float32]  # [3] float32, factor of pixels, first
+    mean: NDArray[np.float32]  # [3] float32, subtracted next
+    std: NDArray[np.float32]  # [3] float32, divisor of the rest
     is_rgb: bool  # whether R comes first
     is_nchw: bool  # whether channels come before rows and columns
 
     @classmethod
-    def read(cls, file: str, metadata: Mapping[str, str]) -> "_Shown":
+    def read(cls, file: str, metadata: Mapping[str, str]) -> "_InputForm":
         """From a file's metadata, complete with the defaults; raises InvalidWeightsError."""
         entries = {key.removeprefix(_PREFIX): text for key, text in metadata.items() if key.startswith(_PREFIX)}
         values = dict(_DEFAULTS)
@@ -76,8 +76,8 @@ class _Shown:
             numbers[name] = numbers[name][::-1]
         return cls(numbers["scale"], numbers["mean"], numbers["std"], is_rgb, is_nchw=values["layout"] == "NCHW")
 
-    def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """[n, height, width, 3] uint8 BGR as the file's input, float32."""
+    def images(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Pixels [n, height, width, 3] uint8 BGR as the file's input, float32."""
         ordered = pixels[..., ::-1] if self.is_rgb else pixels
         images = (ordered.astype(np.float32) * self.scale - self.mean) / self.std
         return np.ascontiguousarray(images.transpose(0, 3, 1, 2) if self.is_nchw else images)
@@ -98,7 +98,7 @@ class _FileRun:
             self._session = onnx_session(content, compute.n_threads or available_cores())
         except Exception as error:
             raise self._failure(f"is no model that ONNX Runtime can run: {_first_line(error)}", error) from error
-        self._shown = _Shown.read(file, self._session.get_modelmeta().custom_metadata_map)
+        self._form = _InputForm.read(file, self._session.get_modelmeta().custom_metadata_map)
         self._input, batch, self.input_size = self._described_input()
         self._output = self._session.get_outputs()[0].name
         self.largest_batch = batch or compute.largest_batch or 1
@@ -106,18 +106,18 @@ class _FileRun:
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
         """See `Run`; raises InvalidWeightsError."""
         try:
-            given = self._session.run([self._output], {self._input: self._shown.of(pixels)})[0]
+            output = self._session.run([self._output], {self._input: self._form.images(pixels)})[0]
         except Exception as error:
             raise self._failure(f"cannot be run: {_first_line(error)}", error) from error
-        shape: tuple[int, ...] = tuple(getattr(given, "shape", ()))  # a file may give a list, too
+        shape: tuple[int, ...] = tuple(getattr(output, "shape", ()))  # a file may give a list, too
         if len(shape) == 4 and shape[2:] == (1, 1):
-            given, shape = given[:, :, 0, 0], shape[:2]
-        if len(shape) != 2 or shape[0] != len(pixels) or shape[1] == 0 or given.dtype.kind != "f":
+            output, shape = output[:, :, 0, 0], shape[:2]
+        if len(shape) != 2 or shape[0] != len(pixels) or shape[1] == 0 or output.dtype.kind != "f":
             raise InvalidWeightsError(
                 f"{self._file} gives {list(shape)} for {len(pixels)} images, and no encodings [{len(pixels)}, d]",
                 file=self._file,
             )
-        encodings = np.asarray(given, np.float32)
+        encodings = np.asarray(output, np.float32)
         length = np.linalg.norm(encodings, axis=1, keepdims=True)
         if not np.isfinite(length).all():
             raise InvalidWeightsError(f"{self._file} gives NaN, infinity or numbers too large", file=self._file)
@@ -127,22 +127,22 @@ class _FileRun:
     def _described_input(self) -> tuple[str, int, tuple[int, int]]:
         """Name, size of a batch (0: any) and (width, height) of the one input."""
         inputs = self._session.get_inputs()
-        wanted = "[n, 3, height, width]" if self._shown.is_nchw else "[n, height, width, 3]"
-        shown = ", ".join(f"{tensor.type} {tensor.shape}" for tensor in inputs) or "nothing"
+        expected = "[n, 3, height, width]" if self._form.is_nchw else "[n, height, width, 3]"
+        actual = ", ".join(f"{tensor.type} {tensor.shape}" for tensor in inputs) or "nothing"
         if len(inputs) == 1 and inputs[0].type == "tensor(float)" and len(inputs[0].shape) == 4:
             batch, first, second, third = (size if isinstance(size, int) else None for size in inputs[0].shape)
-            channels, height, width = (first, second, third) if self._shown.is_nchw else (third, first, second)
+            channels, height, width = (first, second, third) if self._form.is_nchw else (third, first, second)
             sides = (width or _SIDE, height or _SIDE)
             if channels == 3 and batch in {None, 1} and max(sides) <= _LONGEST_SIDE:
                 return inputs[0].name, batch or 0, sides
         raise InvalidWeightsError(
-            f"{self._file} takes {shown}, not one tensor(float) {wanted} with n open or 1", file=self._file
+            f"{self._file} takes {actual}, not one tensor(float) {expected} with n open or 1", file=self._file
         )
 
-    def _failure(self, what: str, error: Exception) -> InvalidWeightsError | OutOfMemoryError:
+    def _failure(self, problem: str, error: Exception) -> InvalidWeightsError | OutOfMemoryError:
         if is_lack_of_memory(error):
             return OutOfMemoryError(f"there is too little memory for {self._file}")
-        return InvalidWeightsError(f"{self._file} {what}", file=self._file)
+        return InvalidWeightsError(f"{self._file} {problem}", file=self._file)
 
 
 def _value(file: str, name: str, text: str) -> Any:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 CELLS = (6, 5)  # rows and columns, as of the default extractor
-TAKEN = {9: 512}  # fire module -> its channels
-ENCODING_DIM = CELLS[0] * CELLS[1] * sum(TAKEN.values())
+OUTPUT_FIRES = {9: 512}  # fire module -> its channels
+ENCODING_DIM = CELLS[0] * CELLS[1] * sum(OUTPUT_FIRES.values())
 _RECIPE = 1  # see `encodings_sha256`
 # Fire module (the paper counts the first convolution as layer 1) -> torchvision's layer, which counts maxima too
 _LAYERS = dict(zip(range(2, 10), (3, 4, 5, 7, 8, 9, 10, 12), strict=True))
@@ -45,7 +45,7 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
     if not has_torch():
         raise MissingPackageError(f"squeezenet needs PyTorch: {INSTALL_TORCH}")
     path, sha256 = Lock.read(compute.weights_dir).pinned(file)
-    # Told from a glance: whether the file is whole shows when it is read
+    # Only the kind of the file is looked at here; whether it is whole shows when it is read
     size = ((CAFFE if _is_npz(path) else TORCHVISION).side,) * 2
     run = make_run(lambda: _module(path), compute, size, f"squeezenet-{_RECIPE}-{sha256[:16]}")
     return NetworkExtractor(run, ENCODING_DIM, encodings_sha256(sha256, _RECIPE), size)
@@ -56,17 +56,17 @@ def _module(path: Path) -> "nn.Module":
 
     weights = read_squeezenet(path)
     preset = weights.preset
-    return SpatialGrid(weights.trunk(tuple(TAKEN)), CELLS, preset.mean, preset.std, is_rgb=preset.is_rgb)
+    return SpatialGrid(weights.trunk(tuple(OUTPUT_FIRES)), CELLS, preset.mean, preset.std, is_rgb=preset.is_rgb)
 
 
 @dataclass(frozen=True)
 class Preset:
-    """What goes with the weights of a family."""
+    """How images are prepared for the weights of a family."""
 
     family: str  # its name
     is_rgb: bool  # whether the network takes red first
-    mean: tuple[float, float, float]  # in that order, of pixels 0..255, taken away from them
-    std: tuple[float, float, float]  # what they are then divided by
+    mean: tuple[float, float, float]  # in that order, subtracted from pixels 0..255
+    std: tuple[float, float, float]  # in that order, divisor of the rest
     side: int  # width and height in pixels
 
 
@@ -82,11 +82,11 @@ class SqueezeNetWeights:
     tensors: Mapping[str, Any]
     file: str
 
-    def trunk(self, taken: tuple[int, ...]) -> "nn.Module":
-        """The network of these weights up to the last fire module taken; raises InvalidWeightsError."""
+    def trunk(self, output_fires: tuple[int, ...]) -> "nn.Module":
+        """The network of these weights, with the maps of some fire modules; raises InvalidWeightsError."""
         from deepsimbad.evaluators.nets.squeezenet import SqueezeNet
 
-        trunk = SqueezeNet(taken)
+        trunk = SqueezeNet(output_fires)
         fill(trunk, self.tensors, self.file)
         return trunk
 
@@ -98,7 +98,7 @@ def read_squeezenet(path: Path) -> SqueezeNetWeights:
     content = load_checkpoint(path)
     if not isinstance(content, Mapping):
         raise InvalidWeightsError(f"{path.name} holds no weights by name", file=path.name)
-    tensors = {ours: content.get(theirs) for ours, theirs in _names(is_caffe=False).items()}
+    tensors = {name: content.get(origin) for name, origin in _names(is_caffe=False).items()}
     return SqueezeNetWeights(TORCHVISION, tensors, path.name)
 
 
@@ -118,9 +118,9 @@ def _of_caffe(path: Path) -> dict[str, Any]:
     tensors: dict[str, Any] = {}
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            for ours, theirs in _names(is_caffe=True).items():
-                if theirs in arrays.files and arrays[theirs].dtype.kind == "f":
-                    tensors[ours] = torch.from_numpy(np.array(arrays[theirs], np.float32))
+            for name, origin in _names(is_caffe=True).items():
+                if origin in arrays.files and arrays[origin].dtype.kind == "f":
+                    tensors[name] = torch.from_numpy(np.array(arrays[origin], np.float32))
     except (ValueError, OSError, EOFError, KeyError, MemoryError, NotImplementedError, RuntimeError, zlib.error,
             zipfile.BadZipFile) as error:  # fmt: skip
         raise InvalidWeightsError(f"{path.name} is no whole archive of arrays", file=path.name) from error
@@ -128,12 +128,12 @@ def _of_caffe(path: Path) -> dict[str, Any]:
 
 
 def _names(is_caffe: bool) -> dict[str, str]:
-    """Ours to the family's."""
+    """The family's names, by those of `SqueezeNet`."""
     names: dict[str, str] = {}
     for kind, short in (("weight", "w"), ("bias", "b")):
         names[f"stem.{kind}"] = f"conv1/{short}" if is_caffe else f"features.0.{kind}"
         for fire, layer in _LAYERS.items():
-            for ours, caffe, torchvision in _PARTS:
-                theirs = f"fire{fire}/{caffe}/{short}" if is_caffe else f"features.{layer}.{torchvision}.{kind}"
-                names[f"fires.{fire}.{ours}.{kind}"] = theirs
+            for part, caffe, torchvision in _PARTS:
+                origin = f"fire{fire}/{caffe}/{short}" if is_caffe else f"features.{layer}.{torchvision}.{kind}"
+                names[f"fires.{fire}.{part}.{kind}"] = origin
     return names

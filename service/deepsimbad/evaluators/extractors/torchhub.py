@@ -40,11 +40,11 @@ from deepsimbad.evaluators.weights.lock import CHECKPOINTS, HUB_FOLDER, HubRecor
 
 _RECIPE = 1  # see `encodings_sha256`
 _NETWORK_EVENTS = {"urllib.Request", "socket.getaddrinfo", "socket.gethostbyname"}
-# A nested `torch.hub.load` asks this first, and is content with what is here where nobody answers.
+# A nested `torch.hub.load` asks this first, and uses the local repository where nobody answers.
 _BRANCH_QUESTION = re.compile(r"https://github\.com/[^/]+/[^/]+/tree/main/")
 
 Download = Callable[[str, Path], None]
-"""Brings what an entry asks for (its address) to where it wants it."""
+"""Downloads an address to a path, as an entry asks torch hub to."""
 
 
 def torchhub(argument: str, compute: Compute) -> NetworkExtractor:
@@ -71,8 +71,8 @@ class HubModule(nn.Module):
 
     Args:
         trunk: The repository's model, from images [n, 3, height, width] normalised as ImageNet's.
-        extractor: Whose it is, for the errors.
-        encoding_dim: d; None: whatever it gives.
+        extractor: Name of the extractor, for the errors.
+        encoding_dim: d that the trunk must give; None: any.
     """
 
     mean: Tensor
@@ -89,17 +89,17 @@ class HubModule(nn.Module):
         """See the class; raises InvalidWeightsError."""
         images = (pixels.permute(0, 3, 1, 2).flip(1).float() / 255.0 - self.mean) / self.std
         parameter = next(self.trunk.parameters(), None)
-        given = self.trunk(images if parameter is None else images.to(parameter.dtype))
-        encodings = self._encodings(given, len(pixels)).float()
+        output = self.trunk(images if parameter is None else images.to(parameter.dtype))
+        encodings = self._encodings(output, len(pixels)).float()
         if not torch.isfinite(encodings).all():
             raise InvalidWeightsError(f"{self._extractor} gives NaN or infinity", extractor=self._extractor)
         length = torch.linalg.vector_norm(encodings, dim=1, keepdim=True)
         neutral = encodings.new_full((), encodings.shape[1] ** -0.5)  # where it sees nothing at all
         return torch.where(length > 0, encodings / length.clamp_min(torch.finfo(torch.float32).tiny), neutral)
 
-    def _encodings(self, given: Any, n: int) -> Tensor:
-        """[n, d]: what the trunk gives, or the first such of several."""
-        parts = given if isinstance(given, tuple | list) else (given,)
+    def _encodings(self, output: Any, n: int) -> Tensor:
+        """[n, d] the encodings in a trunk's output: the output itself, or the first fitting one of several."""
+        parts = output if isinstance(output, tuple | list) else (output,)
         for part in parts:
             if isinstance(part, Tensor) and part.ndim == 2 and len(part) == n and part.is_floating_point():
                 if self._encoding_dim in {None, part.shape[1]}:
@@ -108,9 +108,9 @@ class HubModule(nn.Module):
                     f"{self._extractor} gives encodings of {part.shape[1]} numbers, not {self._encoding_dim}",
                     extractor=self._extractor,
                 )
-        shown = ", ".join(str(list(part.shape)) if isinstance(part, Tensor) else type(part).__name__ for part in parts)
+        shapes = ", ".join(str(list(part.shape)) if isinstance(part, Tensor) else type(part).__name__ for part in parts)
         raise InvalidWeightsError(
-            f"{self._extractor} gives {shown or 'nothing'} for {n} images, and no encodings [{n}, d]",
+            f"{self._extractor} gives {shapes or 'nothing'} for {n} images, and no encodings [{n}, d]",
             extractor=self._extractor,
         )
 
@@ -129,27 +129,27 @@ def parameters_sha256(module: nn.Module) -> str:
 class LoadedEntry:
     """A model that an entry gave."""
 
-    trunk: nn.Module  # the model
-    encoding_dim: int  # d of what it gives
-    read_beside: list[str]  # what else in the hub's folder it read: checkpoints, and other repositories' trees
+    trunk: nn.Module
+    encoding_dim: int  # d of its encodings
+    companions: list[str]  # the checkpoints and the other repositories' trees in the hub's folder that it read
 
 
 @dataclass(frozen=True)
 class HubEntry:
-    """An entry of a repository that lies here."""
+    """An entry of a repository that lies in the hub's folder."""
 
     extractor: str  # torchhub:OWNER/REPO:ENTRY
     hub: Path  # the hub's folder
-    tree: Path  # of the repository, in it
-    arguments: Mapping[str, Argument]  # for the entry
+    tree: Path  # the repository's folder in it
+    arguments: Mapping[str, Argument]  # of the entry
     input_size: tuple[int, int]  # (width, height) of its images
     encoding_dim: int | None  # d it must give; None: any
 
     def load(self, download: Download | None) -> LoadedEntry:
-        """Run it, and show the model that it gives two images.
+        """Run the entry, and try the model that it gives on two images.
 
         Args:
-            download: Brings what it asks torch hub for; None: nothing is asked of a network.
+            download: Downloads what it asks torch hub for; None: nothing may be downloaded.
 
         Raises:
             MissingWeightsError: It wanted to download something, and may not or cannot.
@@ -173,11 +173,11 @@ class HubEntry:
             does_not = f"does not take images of {width} x {height}"
             with _named_failures(self.extractor, does_not, self.tree, watch), torch.inference_mode():
                 encodings = module(torch.zeros((2, height, width, 3), dtype=torch.uint8))
-        return LoadedEntry(model, encodings.shape[1], watch.read_beside(self.hub, self.tree))
+        return LoadedEntry(model, encodings.shape[1], watch.companions(self.hub, self.tree))
 
 
 def load_recorded(lock: Lock, extractor: str, record: HubRecord) -> nn.Module:
-    """The model of a record, from here alone: its files are held to their digests first, then its parameters.
+    """The model of a record, from local files alone: they are held to their digests first, then its parameters.
 
     Raises:
         MissingWeightsError, InvalidWeightsError, MissingPackageError, OutOfMemoryError: As `torchhub`.
@@ -198,37 +198,39 @@ def load_recorded(lock: Lock, extractor: str, record: HubRecord) -> nn.Module:
 
 @dataclass
 class _Watch:
-    """What the thread that loads an entry opens and asks for."""
+    """Records the files that the thread that loads an entry opens, and the addresses that it may not ask."""
 
     may_ask: bool
-    opened: set[str] = field(default_factory=set)
+    opened_files: set[str] = field(default_factory=set)
     refused: list[str] = field(default_factory=list)
 
     def see(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """An audit hook's news of this thread."""
+        """Take an audit event of this thread."""
         if event == "open" and isinstance(arguments[0], str):
-            self.opened.add(arguments[0])
+            self.opened_files.add(arguments[0])
         elif not self.may_ask and event in _NETWORK_EVENTS:
             self.refuse(str(arguments[0]))
         elif not self.may_ask and event == "socket.connect" and isinstance(arguments[1], tuple):
             self.refuse(str(arguments[1]))  # a text would be a socket of this machine
 
     def refuse(self, address: str) -> None:
-        """Let a request fail as it does where there is no network."""
+        """Let a request fail as it does without a network."""
         if _BRANCH_QUESTION.fullmatch(address) is None:
             self.refused.append(address)
         raise URLError(f"{address} is not asked: models are loaded from the weights' folder alone")
 
-    def read_beside(self, hub: Path, tree: Path) -> list[str]:
-        """The files of checkpoints, and the other trees, of which a file was opened."""
-        opened = [Path(name).absolute() for name in self.opened]
-        within = [path.relative_to(hub).parts for path in opened if path.is_relative_to(hub) and path.is_file()]
-        files = {"/".join(parts) for parts in within if parts[0] == CHECKPOINTS}
-        trees = {parts[0] for parts in within if (hub / parts[0] / "hubconf.py").is_file()} - {tree.name}
+    def companions(self, hub: Path, tree: Path) -> list[str]:
+        """The checkpoints that were opened, and the other repositories' trees of which a file was."""
+        opened_files = [Path(name).absolute() for name in self.opened_files]
+        hub_parts = [
+            path.relative_to(hub).parts for path in opened_files if path.is_relative_to(hub) and path.is_file()
+        ]
+        files = {"/".join(parts) for parts in hub_parts if parts[0] == CHECKPOINTS}
+        trees = {parts[0] for parts in hub_parts if (hub / parts[0] / "hubconf.py").is_file()} - {tree.name}
         return sorted(files | trees)
 
 
-_loading = threading.Lock()  # what follows is the whole process's
+_loading = threading.Lock()  # the changes below are to the whole process
 _of_this_thread = threading.local()
 _hooked = False
 
@@ -241,12 +243,12 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 
 @contextlib.contextmanager
 def _as_torch_hub_wants_it(hub: Path, download: Download | None) -> Iterator[_Watch]:
-    """The process as a repository's code expects it, and afterwards as before: its modules' names are free again.
+    """Change the process to what a repository's code expects; afterwards it is as before, and module names are free.
 
-    What the code says is kept off standard output, where it would be taken for an answer.
+    The code's output is kept off standard output, where it would be taken for an answer.
     """
     global _hooked  # noqa: PLW0603 - a hook cannot be taken back
-    with _loading, warnings.catch_warnings(), contextlib.ExitStack() as after:
+    with _loading, warnings.catch_warnings(), contextlib.ExitStack() as cleanup:
         warnings.simplefilter("ignore")
         if not _hooked:
             sys.addaudithook(_hook)
@@ -266,21 +268,21 @@ def _as_torch_hub_wants_it(hub: Path, download: Download | None) -> Iterator[_Wa
 
         hub.mkdir(parents=True, exist_ok=True)
         modules, paths = set(sys.modules), list(sys.path)
-        after.callback(torch.hub.set_dir, torch.hub.get_dir())
+        cleanup.callback(torch.hub.set_dir, torch.hub.get_dir())
         torch.hub.set_dir(hub)
-        for holder, name, instead in (
+        for holder, name, replacement in (
             (torch.hub, "download_url_to_file", bring),
             (torch.hub, "_check_repo_is_trusted", trusted),
             (sys, "dont_write_bytecode", True),
             (sys, "pycache_prefix", str(hub / ".no-pycache")),  # compiled code in a tree is not among its digests
         ):
-            after.callback(setattr, holder, name, getattr(holder, name))
-            setattr(holder, name, instead)
+            cleanup.callback(setattr, holder, name, getattr(holder, name))
+            setattr(holder, name, replacement)
         home = os.environ.get("HF_HOME")
         os.environ["HF_HOME"] = str(hub / "huggingface")  # where huggingface_hub puts what it downloads
         out = sys.stderr if download is not None else io.StringIO()
-        after.enter_context(contextlib.redirect_stdout(out))
-        after.enter_context(contextlib.redirect_stderr(out))
+        cleanup.enter_context(contextlib.redirect_stdout(out))
+        cleanup.enter_context(contextlib.redirect_stderr(out))
         _of_this_thread.watch = watch
         try:
             yield watch
@@ -298,7 +300,9 @@ def _as_torch_hub_wants_it(hub: Path, download: Download | None) -> Iterator[_Wa
 
 
 @contextlib.contextmanager
-def _named_failures(extractor: str, what: str, tree: Path | None = None, watch: _Watch | None = None) -> Iterator[None]:
+def _named_failures(
+    extractor: str, problem: str, tree: Path | None = None, watch: _Watch | None = None
+) -> Iterator[None]:
     """Whatever foreign code raises, as one of our errors."""
     try:
         yield
@@ -320,11 +324,11 @@ def _named_failures(extractor: str, what: str, tree: Path | None = None, watch: 
                 f"{extractor} needs {package}, which is not installed here: pip install it beside the service",
                 extractor=extractor, package=package,
             ) from error  # fmt: skip
-        raise InvalidWeightsError(f"{extractor} {what}: {text}", extractor=extractor) from error
+        raise InvalidWeightsError(f"{extractor} {problem}: {text}", extractor=extractor) from error
 
 
 def _missing_package(error: BaseException, tree: Path | None) -> str | None:
-    """The package that an error misses, where that is what it says and the repository should not have it itself."""
+    """The package whose absence an error reports, unless the repository has a module of that name; else None."""
     missing = re.match(r"Missing dependencies: (.+)", str(error))  # by torch hub, of a repository's own list
     if missing is not None:
         return missing[1]

@@ -22,20 +22,20 @@ _PAIRS = (
 class EfficientNetLite(nn.Module):
     """Images [n, 3, height, width] to the maps behind some blocks."""
 
-    def __init__(self, taken: Sequence[int]) -> None:
+    def __init__(self, output_blocks: Sequence[int]) -> None:
         """Leave the parameters as torch makes them.
 
         Args:
-            taken: Numbers of the blocks whose maps are given, ascending, 0..10; none behind the last is computed.
+            output_blocks: Numbers of the blocks whose maps are given, ascending, 0..10; none behind them is computed.
         """
         super().__init__()
-        self._taken = tuple(taken)
+        self._output_blocks = tuple(output_blocks)
         self._conv_stem = _SameConv(3, _STEM_CHANNELS, 3, 2)
         self._bn0 = nn.BatchNorm2d(_STEM_CHANNELS, _EPSILON)
-        self._blocks = nn.ModuleList(list(_blocks())[: self._taken[-1] + 1])
+        self._blocks = nn.ModuleList(list(_blocks())[: self._output_blocks[-1] + 1])
 
     def folded(self) -> Self:
-        """With every batch normalisation folded into the convolution before it: the same maps, a quarter sooner."""
+        """The network, every batch normalisation folded into the convolution before it: same maps, a quarter sooner."""
         for module in (self, *self._blocks):
             for conv, norm in _PAIRS:
                 if isinstance(getattr(module, conv, None), nn.Conv2d):
@@ -44,12 +44,12 @@ class EfficientNetLite(nn.Module):
         return self
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """Maps [n, channels, height / stride, width / stride], in the order of `taken`."""
+        """Maps [n, channels, height / stride, width / stride], in the order of `output_blocks`."""
         features = functional.relu6(self._bn0(self._conv_stem(images)))
         maps = []
         for number, block in enumerate(self._blocks):
             features = block(features)
-            if number in self._taken:
+            if number in self._output_blocks:
                 maps.append(features)
         return maps
 

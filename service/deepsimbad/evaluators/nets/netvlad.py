@@ -129,20 +129,20 @@ class _Convolution(nn.Conv2d):
         return functional.relu(convolved) if self._rectified else convolved
 
     def _packed_for(self, features: Tensor) -> Tensor:
-        """The weights as the processor wants them; made anew when they were cast or moved since."""
-        made_of = (self.weight.data_ptr(), self.weight.dtype)
+        """The weights in the processor's own layout; made anew after they were cast or moved."""
+        source = (self.weight.data_ptr(), self.weight.dtype)
         packed = self._packed  # two threads at worst both make it
-        if packed is None or packed[0] != made_of:
-            laid_out = torch.ops.mkldnn._reorder_convolution_weight(
+        if packed is None or packed[0] != source:
+            weights = torch.ops.mkldnn._reorder_convolution_weight(
                 self.weight, [1, 1], [1, 1], [1, 1], 1, list(features.shape)
             )
-            packed = self._packed = (made_of, laid_out)
+            packed = self._packed = (source, weights)
         return packed[1]
 
 
 @cache
 def _can_pack(dtype: torch.dtype) -> bool:
-    """Whether this processor and this PyTorch keep weights laid out: the operators belong to torch.compile."""
+    """Whether this processor and PyTorch can keep weights in that layout: the operators belong to torch.compile."""
     operators = ("_convolution_pointwise", "_reorder_convolution_weight", "_is_mkldnn_bf16_supported")
     if platform.machine().lower() not in {"x86_64", "amd64"}:
         return False

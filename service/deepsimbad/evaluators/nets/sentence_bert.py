@@ -29,9 +29,9 @@ class SentenceBert:
         except ImportError as error:
             raise missing(error) from error
         try:
-            self._config = _told_in(folder / "config.json")
+            self._config = _read_json(folder / "config.json")
             pooling = folder / "1_Pooling" / "config.json"
-            by_mean = not pooling.exists() or _told_in(pooling)["pooling_mode_mean_tokens"]
+            by_mean = not pooling.exists() or _read_json(pooling)["pooling_mode_mean_tokens"]
             self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
             self._tokenizer.no_padding()
             self._tokenizer.no_truncation()
@@ -52,19 +52,19 @@ class SentenceBert:
             ) from error
 
     def _embedding(self, text: str) -> NDArray[np.float32]:
-        """[d] of unit length, of a text that is kept for when it is read again."""
+        """[d] the embedding of a text, of unit length."""
         import torch
 
         first, *pieces, last = self._tokenizer.encode(text).ids
         room = min(_MOST_PIECES, int(self._config["max_position_embeddings"])) - 2
-        parts = [pieces[at : at + room] for at in range(0, max(1, len(pieces)), room)]
+        parts = [pieces[start : start + room] for start in range(0, max(1, len(pieces)), room)]
         with torch.inference_mode():
             states = torch.cat([self._states(torch.tensor([first, *part, last])) for part in parts])
             mean = torch.nn.functional.normalize(states.mean(dim=0), dim=0)
         return np.asarray(mean.numpy(), np.float32)
 
     def _states(self, ids: Any) -> Any:
-        """[n, d] the last layer's, of [n] pieces."""
+        """[n, d] states of the last layer, of [n] pieces' ids."""
         import torch
         from torch.nn.functional import embedding, gelu, scaled_dot_product_attention
 
@@ -79,9 +79,9 @@ class SentenceBert:
                 self._linear(x, f"{layer}attention.self.{part}").view(n, n_heads, -1).transpose(0, 1)
                 for part in ("query", "key", "value")
             )
-            seen = scaled_dot_product_attention(q[None], k[None], v[None])[0].transpose(0, 1).reshape(n, -1)
+            attention = scaled_dot_product_attention(q[None], k[None], v[None])[0].transpose(0, 1).reshape(n, -1)
             x = self._norm(
-                x + self._linear(seen, f"{layer}attention.output.dense"), f"{layer}attention.output.LayerNorm"
+                x + self._linear(attention, f"{layer}attention.output.dense"), f"{layer}attention.output.LayerNorm"
             )
             inner = gelu(self._linear(x, f"{layer}intermediate.dense"))
             x = self._norm(x + self._linear(inner, f"{layer}output.dense"), f"{layer}output.LayerNorm")
@@ -99,10 +99,10 @@ class SentenceBert:
         return layer_norm(x, scale.shape, scale, shift, float(self._config["layer_norm_eps"]))
 
 
-def _told_in(file: Path) -> dict[str, Any]:
+def _read_json(file: Path) -> dict[str, Any]:
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
 def missing(error: ImportError) -> MissingPackageError:
-    """What to say where a package of language cannot be imported."""
+    """The error to raise where a package of language cannot be imported."""
     return MissingPackageError(f"a package that language needs cannot be imported: {error}: {INSTALL}")

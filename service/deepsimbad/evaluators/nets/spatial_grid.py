@@ -26,7 +26,7 @@ class SpatialGrid(nn.Module):
             trunk: Images [n, 3, height, width] to maps [n, channels, rows, columns].
             cells: Rows and columns of the grid.
             mean: Of the pixels 0..255, in the order of the channels that the trunk takes.
-            std: Likewise.
+            std: Of the same pixels, in the same order.
             is_rgb: Whether it takes red first.
         """
         super().__init__()

@@ -16,23 +16,25 @@ _POOLED_BEFORE = (2, 5, 9)  # fire modules behind a maximum of 3 x 3 at stride 2
 class SqueezeNet(nn.Module):
     """Images [n, 3, height, width] to the maps behind some fire modules."""
 
-    def __init__(self, taken: Sequence[int]) -> None:
+    def __init__(self, output_fires: Sequence[int]) -> None:
         """Leave the parameters as torch makes them.
 
         Args:
-            taken: Numbers of the fire modules whose maps are given, ascending, 2..9; none behind the last is computed.
+            output_fires: Numbers of the fire modules whose maps are given, ascending, 2..9; none behind is computed.
         """
         super().__init__()
-        self._taken = tuple(taken)
+        self._output_fires = tuple(output_fires)
         self.stem = nn.Conv2d(3, _STEM_CHANNELS, 7, stride=2)
         self.fires = nn.ModuleDict()
         n_inputs = _STEM_CHANNELS
-        for number, (n_squeezed, n_expanded) in enumerate(_FIRES[: self._taken[-1] - _FIRST_FIRE + 1], _FIRST_FIRE):
+        for number, (n_squeezed, n_expanded) in enumerate(
+            _FIRES[: self._output_fires[-1] - _FIRST_FIRE + 1], _FIRST_FIRE
+        ):
             self.fires[str(number)] = _Fire(n_inputs, n_squeezed, n_expanded)
             n_inputs = 2 * n_expanded
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """Maps [n, channels, rows, columns], in the order of `taken`; at stride 4 (fires 2..4), 8 (5..8) or 16 (9)."""
+        """Maps [n, channels, rows, columns], by `output_fires`; at stride 4 (fires 2..4), 8 (5..8) or 16 (9)."""
         features = functional.relu(self.stem(images))
         maps = []
         for number, fire in self.fires.items():
@@ -40,7 +42,7 @@ class SqueezeNet(nn.Module):
                 # Windows may hang over the edge, as in Caffe, which made the weights: torchvision does the same.
                 features = functional.max_pool2d(features, 3, 2, ceil_mode=True)
             features = fire(features)
-            if int(number) in self._taken:
+            if int(number) in self._output_fires:
                 maps.append(features)
         return maps
 

@@ -86,7 +86,7 @@ def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str) -> None:
     """Fill a module's parameters and buffers by name.
 
     Args:
-        module: Whose.
+        module: The module, changed in place.
         tensors: By the module's names; further ones are passed over.
         file: Where they come from, for the error.
 
@@ -97,27 +97,29 @@ def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str) -> None:
 
     if not isinstance(tensors, Mapping):
         raise InvalidWeightsError(f"{file} holds no weights by name", file=file)
-    wanted = module.state_dict()
-    for name, parameter in wanted.items():
-        given = tensors.get(name)
+    parameters = module.state_dict()
+    for name, parameter in parameters.items():
+        tensor = tensors.get(name)
         if (
-            not isinstance(given, torch.Tensor)
-            or given.layout is not torch.strided
-            or given.is_floating_point() != parameter.is_floating_point()
+            not isinstance(tensor, torch.Tensor)
+            or tensor.layout is not torch.strided
+            or tensor.is_floating_point() != parameter.is_floating_point()
         ):
             raise InvalidWeightsError(f"{file} has no {name}: it is of another network", file=file, missing=name)
-        if given.shape != parameter.shape:
+        if tensor.shape != parameter.shape:
             raise InvalidWeightsError(
-                f"{file} has {name} of shape {list(given.shape)}, not {list(parameter.shape)}", file=file, name=name
+                f"{file} has {name} of shape {list(tensor.shape)}, not {list(parameter.shape)}", file=file, name=name
             )
-        if not torch.isfinite(given).all():
+        if not torch.isfinite(tensor).all():
             raise InvalidWeightsError(f"{file} has NaN or infinity in {name}", file=file, name=name)
     # Assigned, not copied: a whitening is half a gigabyte, and the module may have been made without any memory.
-    module.load_state_dict({name: tensors[name].to(parameter.dtype) for name, parameter in wanted.items()}, assign=True)
+    module.load_state_dict(
+        {name: tensors[name].to(parameter.dtype) for name, parameter in parameters.items()}, assign=True
+    )
 
 
 def _numpy_scalars() -> list[Any]:
-    """What a checkpoint names where training left a score in it: numpy's numbers, which are nothing but bytes."""
+    """The globals that a checkpoint with a score in it names: numpy's numbers, which hold no code."""
     scalar = np.float64(0).__reduce__()[0]
     return [
         (scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype,
@@ -175,8 +177,8 @@ def read_variable(path: Path, name: str) -> Any:
     raise InvalidWeightsError(f"{path.name} has no variable {name}: it is of another network", file=path.name)
 
 
-def _body(stream: BinaryIO, kind: int, n_bytes: int, most: int, file: str) -> bytearray:
-    """What a top-level element holds, without its tag, unpacked."""
+def _body(stream: BinaryIO, kind: int, n_bytes: int, limit_bytes: int, file: str) -> bytearray:
+    """The unpacked content of a top-level element, without its tag."""
     if kind not in {_MATRIX, _COMPRESSED}:
         _refuse(file)
     unpack = zlib.decompressobj() if kind == _COMPRESSED else None
@@ -187,10 +189,10 @@ def _body(stream: BinaryIO, kind: int, n_bytes: int, most: int, file: str) -> by
             _refuse(file)
         n_bytes -= len(chunk)
         try:
-            body += chunk if unpack is None else unpack.decompress(chunk, most - len(body) + 1)
+            body += chunk if unpack is None else unpack.decompress(chunk, limit_bytes - len(body) + 1)
         except (zlib.error, MemoryError) as error:
             raise InvalidWeightsError(f"{file} is damaged, or does not fit the memory", file=file) from error
-        if len(body) > most or (unpack is not None and unpack.unconsumed_tail):
+        if len(body) > limit_bytes or (unpack is not None and unpack.unconsumed_tail):
             raise InvalidWeightsError(f"{file} unpacks to more than any file of weights", file=file)
     if unpack is None:
         return body
@@ -218,83 +220,82 @@ class _Reader:
         self._n_parts = 0
 
     def variable(self) -> _Variable:
-        """The variable."""
         try:
             return self._matrix(0, len(self._body), 0)
         except (struct.error, ValueError, IndexError) as error:
             raise InvalidWeightsError(f"{self._file} is no whole MATLAB file", file=self._file) from error
 
-    def _matrix(self, at: int, end: int, depth: int) -> _Variable:
-        """The array between two places: flags, dimensions, name, then what its class says."""
+    def _matrix(self, offset: int, end: int, depth: int) -> _Variable:
+        """The array between two offsets: flags, dimensions, name, then what its class says."""
         self._n_parts += 1
         if depth > _DEEPEST or self._n_parts > _MOST_PARTS:
             raise InvalidWeightsError(
                 f"{self._file} is nested deeper, or in more parts, than any file of weights", file=self._file
             )
-        if at == end:
+        if offset == end:
             return _Variable("", np.empty(0))  # MATLAB's own form of an empty cell
-        flags, at = self._numbers(at, end)
-        sizes, at = self._numbers(at, end)
-        name, at = self._numbers(at, end)
+        flags, offset = self._numbers(offset, end)
+        sizes, offset = self._numbers(offset, end)
+        name, offset = self._numbers(offset, end)
         kind, is_complex = int(flags[0]) & 0xFF, bool(int(flags[0]) & 0x800)
         shape = tuple(int(size) for size in sizes)
         if min(shape, default=-1) < 0:
             _refuse(self._file)
         value: Any = None
         if kind == _CELL:
-            value = [item.value for item in self._matrices(at, end, prod(shape), depth)]
+            value = [item.value for item in self._matrices(offset, end, prod(shape), depth)]
         elif kind == _STRUCT and prod(shape) == 1:
-            value = self._struct(at, end, depth)
+            value = self._struct(offset, end, depth)
         elif kind == _CHAR:
-            value = self._text(at, end)
+            value = self._text(offset, end)
         elif kind in _NUMBERS and not is_complex:
-            numbers, _ = self._numbers(at, end)
+            numbers, _ = self._numbers(offset, end)
             value = numbers.reshape(shape, order="F")
         return _Variable(bytes(name).decode("latin-1"), value)
 
-    def _struct(self, at: int, end: int, depth: int) -> dict[str, Any]:
-        widths, at = self._numbers(at, end)
-        texts, at = self._numbers(at, end)
+    def _struct(self, offset: int, end: int, depth: int) -> dict[str, Any]:
+        widths, offset = self._numbers(offset, end)
+        texts, offset = self._numbers(offset, end)
         width, joined = int(widths[0]), bytes(texts)
         if width <= 0 or len(joined) % width:
             _refuse(self._file)
         fields = [joined[i : i + width].partition(b"\0")[0].decode("latin-1") for i in range(0, len(joined), width)]
-        values = self._matrices(at, end, len(fields), depth)
+        values = self._matrices(offset, end, len(fields), depth)
         return {field: item.value for field, item in zip(fields, values, strict=True)}
 
-    def _matrices(self, at: int, end: int, count: int, depth: int) -> list[_Variable]:
+    def _matrices(self, offset: int, end: int, count: int, depth: int) -> list[_Variable]:
         if count > _MOST_PARTS:
             _refuse(self._file)
         matrices = []
         for _ in range(count):
-            kind, start, stop, following = self._element(at, end)
+            kind, start, stop, following = self._element(offset, end)
             if kind != _MATRIX:
                 _refuse(self._file)
             matrices.append(self._matrix(start, stop, depth + 1))
-            at = following
+            offset = following
         return matrices
 
-    def _text(self, at: int, end: int) -> str:
-        kind, start, stop, _ = self._element(at, end)
+    def _text(self, offset: int, end: int) -> str:
+        kind, start, stop, _ = self._element(offset, end)
         return bytes(self._view[start:stop]).decode({16: "utf-8", 17: "utf-16-le", 4: "utf-16-le"}.get(kind, "latin-1"))
 
-    def _numbers(self, at: int, end: int) -> tuple[NDArray[Any], int]:
+    def _numbers(self, offset: int, end: int) -> tuple[NDArray[Any], int]:
         """The numbers of an element, as a view, and where the next one begins."""
-        kind, start, stop, following = self._element(at, end)
+        kind, start, stop, following = self._element(offset, end)
         if kind not in _STORED:
             _refuse(self._file)
         if start == stop:
             return np.empty(0, _STORED[kind]), following
         return np.frombuffer(self._view[start:stop], _STORED[kind]), following
 
-    def _element(self, at: int, end: int) -> tuple[int, int, int, int]:
-        """(type, first byte, byte behind the last, byte of the next element) of the element at a place."""
-        (word,) = struct.unpack_from("<I", self._view[:end], at)
+    def _element(self, offset: int, end: int) -> tuple[int, int, int, int]:
+        """(type, first byte, byte behind the last, byte of the next element) of the element at an offset."""
+        (word,) = struct.unpack_from("<I", self._view[:end], offset)
         if word >> 16:  # up to four bytes lie in the tag itself
-            kind, start, n_bytes, following = word & 0xFFFF, at + 4, word >> 16, at + 8
+            kind, start, n_bytes, following = word & 0xFFFF, offset + 4, word >> 16, offset + 8
         else:
-            kind, n_bytes = struct.unpack_from("<II", self._view[:end], at)
-            start = at + 8
+            kind, n_bytes = struct.unpack_from("<II", self._view[:end], offset)
+            start = offset + 8
             following = start + n_bytes + -n_bytes % 8
         if start + n_bytes > end:
             _refuse(self._file)

@@ -1,7 +1,7 @@
 """The weights that are known by name: what they are, where they come from and how a configuration names them.
 
-Commits and digests stand here only where they could be looked up; what is unknown is recorded at the first pull, and
-held to from then on (`weights.lock`).
+Commits and digests are given where they could be looked up; others are recorded at the first pull, and every later load
+is held to them (`weights.lock`).
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 Argument = bool | int | float | str | None
-"""What an entry of a torch hub repository may be given by name."""
+"""The value of a keyword argument of a torch hub repository's entry."""
 
 HUB = "torchhub:"
 _NETVLAD = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
@@ -42,11 +42,11 @@ class KnownWeights:
         return None if f"{kind}:" == HUB or not argument else argument
 
 
-def _patch_netvlad(drive: str, there: str, dim: int, size_mb: int | None = None) -> KnownWeights:
+def _patch_netvlad(drive: str, origin: str, dim: int, size_mb: int | None = None) -> KnownWeights:
     file = f"{drive}_WPCA{dim}.pth.tar"
     return KnownWeights(
         f"patch-netvlad-{drive}-{dim}", f"netvlad:{file}", dim, (640, 480), "MIT",
-        url=f"{_PATCH_NETVLAD}/{there}_WPCA{dim}.pth.tar", page="https://github.com/QVPR/Patch-NetVLAD",
+        url=f"{_PATCH_NETVLAD}/{origin}_WPCA{dim}.pth.tar", page="https://github.com/QVPR/Patch-NetVLAD",
         size_mb=size_mb,
     )  # fmt: skip
 
@@ -118,14 +118,14 @@ KNOWN: tuple[KnownWeights, ...] = (
 )  # fmt: skip
 
 
-def known(name: str) -> KnownWeights | None:
-    """The weights of a short name or of an extractor's name; None: they are not known."""
-    wanted = canonical(name)
-    return next((weights for weights in KNOWN if wanted in {weights.name, canonical(weights.extractor)}), None)
+def known_weights(name: str) -> KnownWeights | None:
+    """The weights of a short name or of an extractor's name; None where the library has none."""
+    canonical_name = canonical(name)
+    return next((weights for weights in KNOWN if canonical_name in {weights.name, canonical(weights.extractor)}), None)
 
 
 def canonical(extractor: str) -> str:
-    """An extractor's name with the repository in small letters, in which GitHub sees no difference."""
+    """An extractor's name with the repository in lower case, since GitHub ignores case."""
     if not extractor.startswith(HUB):
         return extractor
     repository, _, entry = extractor.removeprefix(HUB).partition(":")

@@ -39,24 +39,24 @@ class HubRecord:
     """An entry of a torch hub repository, as it was pulled."""
 
     repository: str  # OWNER/REPO, as it was asked for
-    commit: _Commit  # of it
-    archive_sha256: _Sha256  # of the archive that held it
-    tree_sha256: _Sha256  # of what was unpacked; see `tree_sha256`
+    commit: _Commit  # of the repository
+    archive_sha256: _Sha256  # of the archive of that commit
+    tree_sha256: _Sha256  # of the folder unpacked from it; see `tree_sha256`
     arguments: Mapping[str, Argument]  # what the entry is given
     input_size: tuple[_Side, _Side]  # (width, height) images are brought to
     encoding_dim: Annotated[int, Field(ge=1)]  # d of what it gives
     parameters_sha256: _Sha256  # of the parameters it was loaded with, whatever file they come from
-    # digests of what else in the hub's folder loading it reads: checkpoints, and other repositories' trees
+    # digests of the checkpoints and the other repositories' trees in the hub's folder that loading it reads
     beside: Mapping[str, _Sha256]
 
     @property
     def folder(self) -> str:
-        """Of its tree, in the hub's folder."""
+        """The name of its tree in the hub's folder."""
         return hub_tree(self.repository, self.commit)
 
     @property
     def weights_sha256(self) -> str:
-        """Stands for all that its encodings depend on."""
+        """One digest of all that its encodings depend on."""
         parts = [self.tree_sha256, self.parameters_sha256, repr(sorted(self.arguments.items()))]
         parts += [f"{name} {sha256}" for name, sha256 in sorted(self.beside.items())]
         return hashlib.sha256("\n".join([*parts, f"{self.input_size}"]).encode()).hexdigest()
@@ -74,31 +74,30 @@ _DOCUMENT: TypeAdapter[_Document] = TypeAdapter(_Document)
 
 @dataclass(frozen=True)
 class Finding:
-    """A file or tree that was looked at."""
+    """A file or tree that was looked at, and whether it is as recorded."""
 
-    path: Path  # where
-    recorded: str  # its digest in the lock
-    found: str | None  # its digest now; None: it is not there
+    path: Path  # of the file or tree
+    recorded_sha256: str  # its digest in the lock
+    sha256: str | None  # its digest now; None: it is not there
 
     @property
     def is_good(self) -> bool:
-        """Whether it is what was recorded."""
-        return self.found == self.recorded
+        return self.sha256 == self.recorded_sha256
 
     def check(self) -> None:
         """Refuse what is not as recorded.
 
         Raises:
             MissingWeightsError: It is not there.
-            InvalidWeightsError: It is another.
+            InvalidWeightsError: Its digest is another.
         """
-        if self.found is None:
+        if self.sha256 is None:
             raise MissingWeightsError(f"{self.path} is missing: pull it again", file=self.path.name)
         if not self.is_good:
             raise InvalidWeightsError(
-                f"{self.path} has sha256 {self.found} and was recorded with {self.recorded}: it was changed; remove it "
-                "and pull it again",
-                file=self.path.name, recorded=self.recorded, found=self.found,
+                f"{self.path} has sha256 {self.sha256} and was recorded with {self.recorded_sha256}: it was changed; "
+                "remove it and pull it again",
+                file=self.path.name, recorded=self.recorded_sha256, found=self.sha256,
             )  # fmt: skip
 
 
@@ -109,7 +108,7 @@ _KIND_OF_FILE = {"*.onnx": "onnx", "*.mat": "netvlad", "*.pth.tar": "netvlad", "
 class Lock:
     """The records of one weights' folder."""
 
-    folder: Path  # the folder
+    folder: Path
     files: Mapping[str, FileRecord]  # by the name in the folder
     hub: Mapping[str, HubRecord]  # by the extractor's canonical name
 
@@ -128,21 +127,25 @@ class Lock:
 
     def extractors(self) -> list[str]:
         """The extractors whose weights lie in the folder, as configurations name them."""
-        here = {known.extractor for known in KNOWN if known.file is not None and (self.folder / known.file).is_file()}
+        extractors = {
+            weights.extractor
+            for weights in KNOWN
+            if weights.file is not None and (self.folder / weights.file).is_file()
+        }
         for pattern, kind in _KIND_OF_FILE.items():
-            here |= {f"{kind}:{path.name}" for path in self.folder.glob(pattern)}
-        return sorted(here) + sorted(self.hub)
+            extractors |= {f"{kind}:{path.name}" for path in self.folder.glob(pattern)}
+        return sorted(extractors) + sorted(self.hub)
 
     def hub_record(self, extractor: str) -> HubRecord | None:
-        """What is recorded of an entry, by its extractor's name."""
+        """The record of an entry, by its extractor's name; None: it was not pulled."""
         return self.hub.get(canonical(extractor))
 
     def with_file(self, name: str, record: FileRecord) -> "Lock":
-        """With a file recorded, or recorded anew."""
+        """The lock with a file recorded, or recorded anew."""
         return replace(self, files={**self.files, name: record})
 
     def with_hub(self, extractor: str, record: HubRecord) -> "Lock":
-        """With an entry recorded, or recorded anew."""
+        """The lock with an entry recorded, or recorded anew."""
         return replace(self, hub={**self.hub, canonical(extractor): record})
 
     def write(self) -> None:
@@ -170,7 +173,7 @@ class Lock:
         return path, sha256
 
     def findings(self, name: str) -> Iterator[Finding]:
-        """Everything that belongs to a record, looked at one after another."""
+        """The files and trees that belong to a record, each looked at when its turn comes."""
         if name in self.files:
             yield Finding(self.folder / name, self.files[name].sha256, found_sha256(self.folder / name))
             return
