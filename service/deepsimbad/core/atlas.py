@@ -86,20 +86,20 @@ class Atlas:
         self._scales = np.array([map_.log_likelihood_scale for map_ in maps])
         spaces: dict[int, list[tuple[int, tuple[NDArray[Any], ...]]]] = {}
         self._space_of = np.empty(len(maps), np.int64)
-        distinct: list[tuple[NDArray[Any], ...]] = []
+        distinct_spaces: list[tuple[NDArray[Any], ...]] = []
         for index, map_ in enumerate(maps):
             space = _space(map_)
             candidates = spaces.setdefault(hash(space[3].tobytes()), [])
             number = next((n for n, other in candidates if all(map(np.array_equal, space, other))), None)
             if number is None:
-                number = len(distinct)
+                number = len(distinct_spaces)
                 candidates.append((number, space))
-                distinct.append(space)
+                distinct_spaces.append(space)
             self._space_of[index] = number
-        self._spaces = tuple(_shelf(column) for column in zip(*distinct, strict=True))
+        self._spaces = tuple(_shelf(column) for column in zip(*distinct_spaces, strict=True))
         self._lists, self._lengths = _shelf([map_.lists for map_ in maps]), _shelf([map_.lengths for map_ in maps])
-        self._n_landmarks = max(len(space[3]) for space in distinct)
-        self._n_spaces = len(distinct)
+        self._n_landmarks = max(len(space[3]) for space in distinct_spaces)
+        self._n_spaces = len(distinct_spaces)
 
     def log_evidences(self, encoding: NDArray[np.float32]) -> NDArray[np.float64]:
         """[m] log evidence of every map for one encoding [d]."""

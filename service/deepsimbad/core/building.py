@@ -234,35 +234,35 @@ def compose_map(
         space = space.whitened(seen_twice, candidates)
     on_progress(0.85)
     moments, places = Moments.of(training.encodings), space.unit_vectors(training)
-    fused = places
+    fused_places = places
     if season is not None and other is not None:
-        moments, fused = Moments.of(training.encodings, other.encodings), places.copy()
+        moments, fused_places = Moments.of(training.encodings, other.encodings), places.copy()
         images, frames = season.places.T
-        fused[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
+        fused_places[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
     landmark_images = space.candidate_frames if candidates is training else None
     if candidates is second and season is not None and space.candidate_frames is not None:
         landmark_images = _images_of(season.places, space.candidate_frames)
     own_places = None if landmark_images is None else _own_places(map_drive.route(plan.closed), landmark_images)
     barred, initial_space = own_places if plan.bars_own_place else None, space
     if isinstance(candidates, Drive):
-        space = space.fitted(fused, plan.list_length, barred)
+        space = space.fitted(fused_places, plan.list_length, barred)
         map_drive, other = space.measured(training), None if other is None else space.measured(other)
     # Landmarks may be another map's; the moments are this one's, so that robots make the same unit vectors as the map
     model = space.model(moments) if isinstance(candidates, Drive) else {**candidates, "usual": moments.mean_std()}
-    map_ = composed_map(plan, map_drive, fused, moments, model, barred)
-    rehearsal, rehearsal_dissimilarities = map_, measured_dissimilarities(map_drive)
+    map_ = composed_map(plan, map_drive, fused_places, moments, model, barred)
+    rehearsal, dissimilarities = map_, measured_dissimilarities(map_drive)
     if season is not None and second is not None:
         # By the initial landmarks: moved to what both seasons saw, they would know the second one
         rehearsal = initial_space.described_in(map_, places, own_places if candidates is second else barred)
-        rehearsal_dissimilarities = initial_space.dissimilarities(places)
+        dissimilarities = initial_space.dissimilarities(places)
         season = SecondSeason(initial_space.dissimilarities(initial_space.unit_vectors(second)), season.places)
     on_progress(0.92)
     seasons = (training,) if other is None else (training, other)
-    map_, rehearsal = taught(map_, rehearsal, rehearsal_dissimilarities, space.dissimilarities(fused), season, seasons)
+    map_, rehearsal = taught(map_, rehearsal, dissimilarities, space.dissimilarities(fused_places), season, seasons)
     if isinstance(candidates, Drive) and space.candidate_frames is not None:
         map_ = replace(map_, **candidates.landmark_origins(space.candidate_frames))
     on_progress(1.0)
-    return Built(map_, rehearsal, map_drive, other, verdict, fused, initial_space.prototypes, by_camera)
+    return Built(map_, rehearsal, map_drive, other, verdict, fused_places, initial_space.prototypes, by_camera)
 
 
 def taught(
@@ -281,19 +281,19 @@ def taught(
         season: The second season, measured by the rehearsal's landmarks; None: there is none.
         drives: Every season of the route.
     """
-    learnt = rehearsed(rehearsal, dissimilarities, season)
-    map_, rehearsal = replace(map_, **learnt), replace(rehearsal, **learnt)
+    arrays = rehearsed(rehearsal, dissimilarities, season)
+    map_, rehearsal = replace(map_, **arrays), replace(rehearsal, **arrays)
     views = own_views(map_, places)
     first_encodings, *other_encodings = (drive.encodings for drive in drives)
     strangest = max(
         [most_strange(first_encodings), *(most_strange(first_encodings, other) for other in other_encodings)]
     )
-    learnt = {
+    arrays = {
         "view_bits": view_bits(map_, views, rehearsal, season),
         "coverage": placed_rightly(rehearsal, views, season),
         "most_strange": np.array([strangest]),
     }
-    return replace(map_, **learnt), replace(rehearsal, **learnt)
+    return replace(map_, **arrays), replace(rehearsal, **arrays)
 
 
 def composed_map(

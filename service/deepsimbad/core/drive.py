@@ -232,9 +232,11 @@ class Drive:
 def _check_near(
     name: str, values_m: NDArray[np.float64], index: NDArray[np.int64], error: type[InvalidInputError]
 ) -> None:
-    far = np.abs(values_m) > MAX_POSITION_M  # not NaN
-    if far.any():
-        raise error(f"{name} of frame {index[far][0]} is {values_m[far][0]:g} m: {MAX_POSITION_M:g} m is the most")
+    is_far = np.abs(values_m) > MAX_POSITION_M  # not NaN
+    if is_far.any():
+        raise error(
+            f"{name} of frame {index[is_far][0]} is {values_m[is_far][0]:g} m: {MAX_POSITION_M:g} m is the most"
+        )
 
 
 def _integers(values: NDArray[np.int64], name: str) -> NDArray[np.int64]:
@@ -379,14 +381,14 @@ def judge(
 
 def _stations(places: NDArray[np.int64], position_m: NDArray[np.float64]) -> NDArray[np.int64]:
     """[s, 2] some of the pairs, in route order: the first of each stretch of equal length that has any."""
-    ordered = places[np.argsort(position_m[places[:, 0]], kind="stable")]
-    if len(ordered) == 0:
-        return ordered
-    at_m = position_m[ordered[:, 0]] - position_m[ordered[0, 0]]
+    pairs = places[np.argsort(position_m[places[:, 0]], kind="stable")]
+    if len(pairs) == 0:
+        return pairs
+    at_m = position_m[pairs[:, 0]] - position_m[pairs[0, 0]]
     station_m = np.clip(_STATION_M, at_m[-1] / _MOST_STATIONS, at_m[-1] / _FEWEST_STATIONS)
     # A pair on a border belongs to the stretch behind it, however positions were rounded.
     stretch = np.floor(at_m / station_m * (1 + 1e-9)) if station_m > 0 else at_m
-    return np.asarray(ordered[np.unique(stretch, return_index=True)[1]], np.int64)
+    return np.asarray(pairs[np.unique(stretch, return_index=True)[1]], np.int64)
 
 
 def _scores(dissimilarities: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -409,10 +411,10 @@ def _agreement(scores: NDArray[np.float64], other_scores: NDArray[np.float64]) -
     if similarity.std() < _LEAST_SPREAD:
         return 0.0
     # By ranks a few places that are unlike all others (tunnels) count no more than other places do.
-    ranked = (_normal_ranks(similarity) + _normal_ranks(similarity.T).T) / 2
-    spectrum = np.fft.fft2(ranked)
+    normal_similarity = (_normal_ranks(similarity) + _normal_ranks(similarity.T).T) / 2
+    spectrum = np.fft.fft2(normal_similarity)
     power = np.square(np.abs(spectrum))
-    cycles = np.arange(_LEAST_CYCLES, (len(ranked) + 1) // 2)
+    cycles = np.arange(_LEAST_CYCLES, (len(normal_similarity) + 1) // 2)
     # A drive's few slow frequencies are its strongest, and those that noise and inexact positions spoil least. Divided
     # by the square root of the strength that they would have by chance, they lead without deciding alone.
     by_chance = power.sum(axis=1)[cycles] * power.sum(axis=0)[-cycles]

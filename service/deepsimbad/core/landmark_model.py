@@ -184,12 +184,12 @@ def pack_landmarks(portable: PortableLandmarks) -> bytes:
         "n_landmarks": np.array(portable.n_landmarks, np.int64),
         "weights_sha256": np.array(portable.weights_sha256),
     }
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in sorted({**portable.model, **metadata}.items()):
             with archive.open(zipfile.ZipInfo(f"{name}.npy", _EPOCH), "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, _little_endian(np.asarray(array)), allow_pickle=False)
-    return packed.getvalue()
+    return buffer.getvalue()
 
 
 def unpack_landmarks(content: bytes) -> PortableLandmarks:

@@ -226,17 +226,17 @@ class Map:
         }
         return replace(self, **parts)
 
-    def with_images(self, new: Mapping[str, NDArray[Any] | None]) -> Self:
+    def with_images(self, new_arrays: Mapping[str, NDArray[Any] | None]) -> Self:
         """The map with further images, merged by route position; of images at one position the old come first.
 
         Args:
-            new: Named arrays of the m new images. An array that only the old or only the new images have is filled up
+            new_arrays: Those of the m new images. An array that only the old or only the new images have is filled up
                 with its unknown value.
         """
         arrays: dict[str, NDArray[Any]] = {}
-        n_old, n_new = self.n_images, new["position_m"].size  # type: ignore[union-attr]
+        n_old, n_new = self.n_images, new_arrays["position_m"].size  # type: ignore[union-attr]
         for name, row in ARRAYS.items():
-            old_array, new_array = getattr(self, name), new.get(name)
+            old_array, new_array = getattr(self, name), new_arrays.get(name)
             if "n" not in row.axes or (old_array is None and new_array is None):
                 continue
             if old_array is None:
@@ -245,11 +245,11 @@ class Map:
                 new_array = np.full(n_new, row.unknown, row.dtype)
             arrays[name] = np.concatenate([old_array, new_array], axis=row.axes.index("n"))
         order = np.argsort(arrays["position_m"], kind="stable")
-        merged: dict[str, Any] = {
+        images: dict[str, Any] = {
             name: np.ascontiguousarray(array.take(order, ARRAYS[name].axes.index("n")))
             for name, array in arrays.items()
         }
-        return replace(self, **merged)
+        return replace(self, **images)
 
     @cached_property
     def n_images(self) -> int:
@@ -359,8 +359,8 @@ class Map:
         """
         is_strange = view.encoding is not None and self.is_strange(view.encoding, live)
         if live is not None and view.is_informative:
-            new = 1.0 if moved_m is None else min(1.0, abs(moved_m))  # a robot that stands sees nothing new
-            live = live.observing(view, new * (_WORTH_STRANGE if is_strange else 1.0))
+            worth = 1.0 if moved_m is None else min(1.0, abs(moved_m))  # a robot that stands sees nothing new
+            live = live.observing(view, worth * (_WORTH_STRANGE if is_strange else 1.0))
         return live, is_strange
 
     @cached_property

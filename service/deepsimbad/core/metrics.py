@@ -52,10 +52,10 @@ class RetrievalScorer:
     def result(self) -> RetrievalScores:
         """The scores so far; NaN where no query was scored."""
         ranks, shares = np.array(self._ranks), np.array(self._shares)
-        scored = ranks.size > 0
+        is_scored = ranks.size > 0
         return RetrievalScores(
-            anr=float(100 * shares.mean()) if scored else float("nan"),
-            recall_at={k: float(100 * (ranks < k).mean()) if scored else float("nan") for k in self._recall_ranks},
+            anr=float(100 * shares.mean()) if is_scored else float("nan"),
+            recall_at={k: float(100 * (ranks < k).mean()) if is_scored else float("nan") for k in self._recall_ranks},
             n_queries=ranks.size,
             n_left_out=self._n_left_out,
             normalised_ranks=shares,
@@ -71,7 +71,7 @@ def mean_interval(
         block = np.arange(values.size)
     _, block = np.unique(block, return_inverse=True)
     sums, counts = np.bincount(block, values), np.bincount(block)
-    drawn = rng.integers(0, sums.size, (_RESAMPLES, sums.size))
-    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    draws = rng.integers(0, sums.size, (_RESAMPLES, sums.size))
+    means = sums[draws].sum(axis=1) / counts[draws].sum(axis=1)
     low, high = np.percentile(means, _LEVELS)
     return float(low), float(high)

@@ -179,9 +179,9 @@ def repeated_after(map_: Map, dissimilarities: NDArray[np.float32]) -> NDArray[n
         product = square = 0.0
         for pair, later_relevance in zip(pairs, later_relevances, strict=True):
             carried_relevance = moved_along(route, first_relevances[pair], float(moved_m[pair]))
-            wrong = np.abs(route.offset_m(at_m, float(at_m[later_images[pair]]))) > _OWN_PLACE_M
-            product += float(carried_relevance[wrong] @ later_relevance[wrong])
-            square += float(carried_relevance[wrong] @ carried_relevance[wrong])
+            is_wrong = np.abs(route.offset_m(at_m, float(at_m[later_images[pair]]))) > _OWN_PLACE_M
+            product += float(carried_relevance[is_wrong] @ later_relevance[is_wrong])
+            square += float(carried_relevance[is_wrong] @ carried_relevance[is_wrong])
         if square > 0:
             slopes[lag] = product / square
     lags, is_measured = np.arange(n_lags + 1), np.isfinite(slopes)
@@ -220,8 +220,8 @@ def smoothed(
     means[:] = mean
     for row, (low, high) in enumerate(zip(first, stop, strict=True)):
         if high > low:
-            near = np.exp(-0.5 * np.square((at_m[low:high] - grid_m[row]) / over_m))
-            means[row] = (near @ values[low:high] + mean_weight * mean) / (near.sum() + mean_weight)
+            weights = np.exp(-0.5 * np.square((at_m[low:high] - grid_m[row]) / over_m))
+            means[row] = (weights @ values[low:high] + mean_weight * mean) / (weights.sum() + mean_weight)
     return means
 
 
@@ -278,19 +278,18 @@ def placed_rightly(rehearsal: Map, views: OwnViews, season: SecondSeason | None)
         views: Of the map's own places.
         season: The second season; None: there is none.
     """
-    expected = _share_by_image(rehearsal, views.images, views.near_shares)
+    expected_shares = _share_by_image(rehearsal, views.images, views.near_shares)
     if season is None:
-        return expected.astype(np.float32)
+        return expected_shares.astype(np.float32)
     images, frames = season.places[:: -(-len(season.places) // _MOST_VIEWS)].T
     is_right, route = np.empty(images.size), rehearsal.route
     for start in range(0, images.size, _AT_ONCE):
         block = slice(start, start + _AT_ONCE)
         best = relevances(rehearsal, season.views(frames[block])).argmax(axis=1)
         is_right[block] = np.abs(route.offset_m(route.position_m[best], route.position_m[images[block]])) <= WITHIN_M
-    counted = _share_by_image(rehearsal, images, is_right)
-    return ((expected + counted) / 2).astype(
-        np.float32
-    )  # recordings did not show which of the two orders places better
+    counted_shares = _share_by_image(rehearsal, images, is_right)
+    # Recordings did not show which of the two orders places better
+    return ((expected_shares + counted_shares) / 2).astype(np.float32)
 
 
 def _share_by_image(map_: Map, images: NDArray[np.int64], shares: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -104,8 +104,8 @@ def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def strangeness(encodings: NDArray[np.floating], moments: Moments) -> NDArray[np.float64]:
     """[...] the share of the numbers of encodings [..., d] that are over two standard deviations from the mean."""
-    far = np.abs(encodings - moments.mean) > FAR_STD * moments.std
-    return np.asarray(far.mean(axis=-1))
+    is_far = np.abs(encodings - moments.mean) > FAR_STD * moments.std
+    return np.asarray(is_far.mean(axis=-1))
 
 
 def most_strange(first: NDArray[np.float32], second: NDArray[np.float32] | None = None) -> float:
@@ -194,11 +194,11 @@ class LiveStatistics:
 
     def from_arrays(self, arrays: dict[str, NDArray[np.float64]]) -> "LiveStatistics":
         """The statistics whose arrays `to_arrays` gave, on the same map; raises KeyError where one is missing."""
-        restored: dict[str, Any] = {}
+        moments_by_name: dict[str, Any] = {}
         for name, moments in self._moments().items():
             mean, square = arrays[name]
-            restored[name] = replace(moments, mean=mean, square=square, weight=arrays[f"{name}_weight"].item())
-        return replace(self, **restored)
+            moments_by_name[name] = replace(moments, mean=mean, square=square, weight=arrays[f"{name}_weight"].item())
+        return replace(self, **moments_by_name)
 
     def _moments(self) -> dict[str, Moments]:
         moments_by_name = {"ranks": self.ranks, "encodings": self.encodings, "products": self.products}

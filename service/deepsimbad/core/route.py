@@ -240,9 +240,9 @@ def true_images_of(
     near_frames = []
     for frame in query_frames:
         ids = candidates(float(x_m[frame]), float(y_m[frame]))
-        near = np.hypot(map_x_m[ids] - x_m[frame], map_y_m[ids] - y_m[frame]) <= tolerance_m
+        is_near = np.hypot(map_x_m[ids] - x_m[frame], map_y_m[ids] - y_m[frame]) <= tolerance_m
         turn = np.abs((map_headings[ids] - headings[frame] + np.pi) % (2 * np.pi) - np.pi)
-        near_frames.append(ids[near & ~(turn > max_heading_rad)])  # an unknown heading excludes nothing
+        near_frames.append(ids[is_near & ~(turn > max_heading_rad)])  # an unknown heading excludes nothing
     return near_frames
 
 
@@ -250,15 +250,15 @@ def same_places(frames: Route, map_route: Route, tolerance_m: float = 2.0) -> ND
     """[k, 2] pairs (map image, frame) of the same place: every frame with the nearest of its true map images."""
     planes = (frames.x_m, frames.y_m, map_route.x_m, map_route.y_m)
     pairs = []
-    for frame, near in enumerate(true_images_of(frames, map_route, tolerance_m)):
-        if near.size == 0:
+    for frame, near_images in enumerate(true_images_of(frames, map_route, tolerance_m)):
+        if near_images.size == 0:
             continue
         if any(axis is None for axis in planes):
-            distance_m = np.abs(map_route.offset_m(map_route.position_m[near], float(frames.position_m[frame])))
+            distance_m = np.abs(map_route.offset_m(map_route.position_m[near_images], float(frames.position_m[frame])))
         else:
             x_m, y_m, map_x_m, map_y_m = (np.asarray(axis) for axis in planes)
-            distance_m = np.hypot(map_x_m[near] - x_m[frame], map_y_m[near] - y_m[frame])
-        pairs.append((int(near[np.argmin(distance_m)]), frame))
+            distance_m = np.hypot(map_x_m[near_images] - x_m[frame], map_y_m[near_images] - y_m[frame])
+        pairs.append((int(near_images[np.argmin(distance_m)]), frame))
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
@@ -268,8 +268,8 @@ def _near_along(map_route: Route, at_m: float, tolerance_m: float) -> NDArray[np
     slack_m = 1e-9 * (abs(at_m) + 1.0)  # the window must not round to less than the distance below, which decides
     window_m = (at_m - tolerance_m - slack_m, at_m + tolerance_m + slack_m)
     first, last = np.searchsorted(map_route.position_m, window_m)
-    near = np.abs(map_route.offset_m(map_route.position_m[first:last], at_m)) <= tolerance_m
-    return np.asarray(first + np.flatnonzero(near), np.int64)
+    is_near = np.abs(map_route.offset_m(map_route.position_m[first:last], at_m)) <= tolerance_m
+    return np.asarray(first + np.flatnonzero(is_near), np.int64)
 
 
 def _near_in_plane(x_m: NDArray[np.float64], y_m: NDArray[np.float64], tolerance_m: float) -> _NearPoint:
@@ -279,13 +279,13 @@ def _near_in_plane(x_m: NDArray[np.float64], y_m: NDArray[np.float64], tolerance
     of the eight around it: a drive of 26,000 frames is matched in a second, not in half a minute.
     """
     all_images = np.arange(x_m.size)
-    located = all_images[np.isfinite(x_m) & np.isfinite(y_m)]
+    known_images = all_images[np.isfinite(x_m) & np.isfinite(y_m)]
     if not np.isfinite(tolerance_m) or tolerance_m <= 0:
         return lambda _x, _y: all_images
     nowhere = all_images[:0]
     squares: defaultdict[tuple[float, float], list[int]] = defaultdict(list)
-    columns, rows = np.floor(x_m[located] / tolerance_m), np.floor(y_m[located] / tolerance_m)
-    for image, column, row in zip(located.tolist(), columns.tolist(), rows.tolist(), strict=True):
+    columns, rows = np.floor(x_m[known_images] / tolerance_m), np.floor(y_m[known_images] / tolerance_m)
+    for image, column, row in zip(known_images.tolist(), columns.tolist(), rows.tolist(), strict=True):
         squares[column, row].append(image)
     around = [(right, up) for right in (-1, 0, 1) for up in (-1, 0, 1)]
 
@@ -321,9 +321,9 @@ def on_earth(
         lat_deg, lon_deg, height_m: Of the origin, the height above the ellipsoid.
         bearing_deg: Of the y axis, clockwise from north.
     """
-    turned = math.radians(bearing_deg)
-    east_m = x_m * math.cos(turned) + y_m * math.sin(turned)
-    north_m = y_m * math.cos(turned) - x_m * math.sin(turned)
+    bearing_rad = math.radians(bearing_deg)
+    east_m = x_m * math.cos(bearing_rad) + y_m * math.sin(bearing_rad)
+    north_m = y_m * math.cos(bearing_rad) - x_m * math.sin(bearing_rad)
     latitude = math.radians(lat_deg)
     eccentricity = _FLATTENING * (2 - _FLATTENING)
     bulge = 1 - eccentricity * math.sin(latitude) ** 2

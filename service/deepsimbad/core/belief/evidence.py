@@ -42,16 +42,16 @@ class ViewEvidence:
     rule: UpdateRule
     # [n] log-likelihoods but for a constant, of mean 0; or the weights that additive rules add
     values: NDArray[np.float64]
-    shared: float = 0.0  # c', share of its error that is that of the view before; 0 of a first view
+    shared_error: float = 0.0  # c', share of its error that is that of the view before; 0 of a first view
 
     @classmethod
-    def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared: float = 0.0) -> Self:
+    def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared_error: float = 0.0) -> Self:
         """From a view's relevance [n], which times `scale` is a log-likelihood."""
         if rule is UpdateRule.ADDITIVE_RELEVANCE:
             return cls(rule, np.maximum(relevance, 0).astype(np.float64))
         if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
             return cls(rule, 1.0 / mean_ranks(relevance))
-        return cls(rule, _centred(relevance, scale), shared if rule is UpdateRule.MIXTURE else 0.0)
+        return cls(rule, _centred(relevance, scale), shared_error if rule is UpdateRule.MIXTURE else 0.0)
 
     def likelihood(
         self, values: NDArray[np.float64], last: NDArray[np.float64] | None
@@ -67,7 +67,7 @@ class ViewEvidence:
             knew nothing which they would have moved elsewhere, as far as it is small.
         """
         trust = TRUSTS_OF[self.rule][0]
-        exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared)), trust)
+        exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared_error)), trust)
         return np.exp(exponent, out=exponent), 0.5 * trust * size
 
     @property
@@ -90,17 +90,17 @@ def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float64
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _news(
-    values: NDArray[np.float64], last: NDArray[np.float64], shared: float, trust: float
+    values: NDArray[np.float64], last: NDArray[np.float64], shared_error: float, trust: float
 ) -> tuple[NDArray[np.float64], float]:
-    """What values [m] say beyond the last ones [m], of whose error theirs contains the share `shared`.
+    """What values [m] say beyond the last ones [m], of whose error theirs contains the share `shared_error`.
 
     Returns:
         [m] `trust` times that, shifted so that the greatest is 0; and the mean size of it without trust and shift.
     """
-    news, size, factor = np.empty(values.size), 0.0, trust / (1 + shared)
-    greatest = factor * (values[0] - shared * last[0])
+    news, size, factor = np.empty(values.size), 0.0, trust / (1 + shared_error)
+    greatest = factor * (values[0] - shared_error * last[0])
     for i in range(values.size):
-        news[i] = factor * (values[i] - shared * last[i])
+        news[i] = factor * (values[i] - shared_error * last[i])
         size += abs(news[i])
     for i in range(values.size):
         greatest = max(greatest, news[i])

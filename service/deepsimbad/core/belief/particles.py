@@ -69,8 +69,8 @@ class ParticleFilter:
     ) -> Self:
         """Particles drawn around a position; none is beyond the ends of an open route."""
         rng = np.random.default_rng([seed, 0, _START])
-        drawn = position_m + std_m * rng.standard_normal(n_particles)
-        return cls._equal(route, _onto(route, drawn), seed, rule, LOST_AT_FIX)
+        drawn_m = position_m + std_m * rng.standard_normal(n_particles)
+        return cls._equal(route, _onto(route, drawn_m), seed, rule, LOST_AT_FIX)
 
     @classmethod
     def _equal(cls, route: Route, position_m: NDArray[np.float64], seed: int, rule: UpdateRule, lost: float) -> Self:
@@ -148,8 +148,8 @@ class ParticleFilter:
         if evidence.is_added:
             images, on_route = self.route.nearest_image(self.position_m), 1 - self.doubt.lost
             weights = np.outer(on_route, added(self._mean_weights / on_route.mean(), evidence.values[images]))
-            weighed = replace(self, weights=weights, found_mass=np.zeros_like(self.found_mass))
-            belief = weighed if self.doubt.is_mixture else weighed._evened_out(step)
+            belief = replace(self, weights=weights, found_mass=np.zeros_like(self.found_mass))
+            particles = belief if self.doubt.is_mixture else belief._evened_out(step)
         else:
             values = self.route.places.means(evidence.values)
             likelihood, least_moved = evidence.likelihood(values, self.doubt.last)
@@ -164,10 +164,10 @@ class ParticleFilter:
                 found_mass = np.where(is_excluded, self.found_mass * scale, found_mass)
             total = weights.sum(axis=1) + found_mass + lost
             doubt = Doubt(lost / total, self.doubt.log_trust + np.log(total / average), values)
-            weighed = replace(self, weights=weights / total[:, np.newaxis], found_mass=found_mass / total, doubt=doubt)
-            belief = weighed._with_found_placed(profile, step) if doubt.is_mixture else weighed._evened_out(step)
-        mass_moved = 0.5 * float(np.abs(weighed._believed - self._believed).sum())
-        return replace(belief, mass_moved=max(mass_moved, least_moved))
+            belief = replace(self, weights=weights / total[:, np.newaxis], found_mass=found_mass / total, doubt=doubt)
+            particles = belief._with_found_placed(profile, step) if doubt.is_mixture else belief._evened_out(step)
+        mass_moved = 0.5 * float(np.abs(belief._believed - self._believed).sum())
+        return replace(particles, mass_moved=max(mass_moved, least_moved))
 
     def _likelihoods(self, profile: "_Profile") -> NDArray[np.float64]:
         """[t, m] likelihoods of the particles, by trust; of a mixture the means over their stretches."""
@@ -180,8 +180,8 @@ class ParticleFilter:
     @property
     def _believed(self) -> NDArray[np.float64]:
         """[m + 1] belief of the particles and of the found mass, given that the robot is on the route; sums to 1."""
-        believed = np.append(self._mean_weights, self.doubt.trust @ self.found_mass)
-        return np.asarray(believed / max(believed.sum(), _NOTHING))
+        masses = np.append(self._mean_weights, self.doubt.trust @ self.found_mass)
+        return np.asarray(masses / max(masses.sum(), _NOTHING))
 
     def _evened_out(self, step: int) -> Self:
         """Resampled where the effective sample size has fallen below half the particles."""

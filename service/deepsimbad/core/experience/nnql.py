@@ -146,7 +146,7 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
     rule = config.update or map_.update_rule
     belief, live = GridFilter.uniform(route, rule), map_.live_statistics
     nearest: list[NDArray[np.int64]] = []
-    rewarded: list[tuple[int, int, float]] = []  # view, action, reward
+    outcomes: list[tuple[int, int, float]] = []  # view, action, reward
     for t, query in enumerate(walk.queries):
         if t > 0:
             action_m = float(walk.action_m[t])
@@ -166,15 +166,15 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
         if abs(actions_m[action] - walk.action_m[t]) <= reach_m:
             truth = route.nearest_image(walk.true_position_m[[t]]).astype(np.int64)
             is_earned = rank_of_truth(belief.mass, truth) < config.top_share * route.n_images
-            rewarded.append((t, action, config.reward * is_earned))
-    views = np.array([view for view, _, _ in rewarded], np.int64)
+            outcomes.append((t, action, config.reward * is_earned))
+    views = np.array([view for view, _, _ in outcomes], np.int64)
     k = min(config.n_neighbours, route.n_images)
     rows = np.array(nearest, np.int64).reshape(-1, k)
     ahead_m = walk.true_position_m[views][:, np.newaxis] + actions_m
     return Transitions(
         nearest=rows[views - 1],
-        action=np.array([action for _, action, _ in rewarded], np.int64),
-        reward=np.array([reward for _, _, reward in rewarded], np.float64),
+        action=np.array([action for _, action, _ in outcomes], np.int64),
+        reward=np.array([reward for _, _, reward in outcomes], np.float64),
         next_nearest=rows[views],
         next_allowed=route.reaches(ahead_m),
     )

@@ -122,8 +122,8 @@ def _code(
     lists: NDArray[np.uint16],
     stream: NDArray[np.uint8],
     is_read: bool,
-    first: int,
-    alike: NDArray[np.int8],
+    first_image: int,
+    likeness: NDArray[np.int8],
     shares: NDArray[np.int32],
     counts_after: NDArray[np.int64],
     counts: NDArray[np.int64],
@@ -136,14 +136,14 @@ def _code(
     """
     (h, n), r = lists.shape, last_images.size
     powers, coder = _powers(r), _coder(stream, is_read)
-    previous_likeness, own_likeness, likely = np.zeros(r, np.int32), np.zeros(r, np.int32), np.zeros(r, np.int32)
+    previous_likeness, own_likeness, likelihoods = np.zeros(r, np.int32), np.zeros(r, np.int32), np.zeros(r, np.int32)
     choice = np.zeros(h + 1, np.int32)
-    for image in range(first, first + n):
+    for image in range(first_image, first_image + n):
         if coder[_AT] > 8 * stream.size + _STATE_BITS:
             return stream.size + 1
-        row = lists[:, image - first]
+        row = lists[:, image - first_image]
         earlier = previous[:h] if previous[0] >= 0 else previous[:0]
-        _sum_alike(previous_likeness, alike, earlier, shares[0])
+        _sum_alike(previous_likeness, likeness, earlier, shares[0])
         place_before = int(previous[h])
         previous[h] = h
         for j in range(h):
@@ -159,12 +159,12 @@ def _code(
             if place < h:
                 row[j] = earlier[place]
             else:
-                _sum_alike(own_likeness, alike, row[:j], shares[0])
+                _sum_alike(own_likeness, likeness, row[:j], shares[0])
                 worth = shares[1, j] * previous_likeness + shares[2, j] * own_likeness
-                _weigh_others(likely, worth, last_images, image - _RECENT, powers)
-                likely[row[:j]] = 1  # a landmark twice in a list is all but impossible
-                likely[earlier] = 0
-                row[j] = _symbol(likely, int(row[j]), coder, stream, is_read)
+                _weigh_others(likelihoods, worth, last_images, image - _RECENT, powers)
+                likelihoods[row[:j]] = 1  # a landmark twice in a list is all but impossible
+                likelihoods[earlier] = 0
+                row[j] = _symbol(likelihoods, int(row[j]), coder, stream, is_read)
         previous[:h] = row
         last_images[row] = image
     if is_read:
@@ -196,23 +196,23 @@ def _place_of(landmark: int, earlier: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _sum_alike(sums: NDArray[np.int32], alike: NDArray[np.int8], landmarks: Any, weights: NDArray[np.int32]) -> None:
+def _sum_alike(sums: NDArray[np.int32], likeness: NDArray[np.int8], landmarks: Any, weights: NDArray[np.int32]) -> None:
     """Write how much every landmark [r] is like the weighted sum of `landmarks`."""
     sums[:] = 0
-    for place in range(landmarks.size if alike.size else 0):
-        weight, of_landmark = weights[place], alike[landmarks[place]]
-        for other in range(sums.size):
-            sums[other] += weight * np.int32(of_landmark[other])
+    for place in range(landmarks.size if likeness.size else 0):
+        weight, of_landmark = weights[place], likeness[landmarks[place]]
+        for landmark in range(sums.size):
+            sums[landmark] += weight * np.int32(of_landmark[landmark])
 
 
 @njit(cache=True, nogil=True)
-def _weigh_others(likely: Any, worth: Any, last_images: Any, recent: int, powers: Any) -> None:
+def _weigh_others(likelihoods: Any, worth: Any, last_images: Any, recent: int, powers: Any) -> None:
     """Write how likely each landmark [r] is, by its worth and whether it was listed since image `recent`."""
-    for other in range(likely.size):
-        likely[other] = (worth[other] >> 10) + (_RECENT_PARTS if last_images[other] >= recent else 0)
-    lowest = likely.max() - powers.size + 1
-    for other in range(likely.size):
-        likely[other] = powers[max(0, likely[other] - lowest)]
+    for landmark in range(likelihoods.size):
+        likelihoods[landmark] = (worth[landmark] >> 10) + (_RECENT_PARTS if last_images[landmark] >= recent else 0)
+    lowest = likelihoods.max() - powers.size + 1
+    for landmark in range(likelihoods.size):
+        likelihoods[landmark] = powers[max(0, likelihoods[landmark] - lowest)]
 
 
 @njit(cache=True, nogil=True)

@@ -101,8 +101,8 @@ def _simbad(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.flo
         return np.stack([_simbad(map_, query.at(row), None) for row in range(len(query.ranks))])
     h_hot = np.where(query.ranks <= map_.list_length, query.dissimilarities, 0.0).astype(np.float64)
     values = h_hot[map_.lists]  # [h, n]
-    squared = np.square(h_hot).sum() + (np.square(values - map_.values) - np.square(values)).sum(axis=0)
-    return np.asarray(-np.sqrt(np.maximum(squared, 0.0)), np.float32)
+    squared_distances = np.square(h_hot).sum() + (np.square(values - map_.values) - np.square(values)).sum(axis=0)
+    return np.asarray(-np.sqrt(np.maximum(squared_distances, 0.0)), np.float32)
 
 
 def _brute_force(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
@@ -115,8 +115,8 @@ def _brute_force(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[n
         raise InvalidInputError(f"an encoding of {queries.shape[1]} numbers; the map's have {encodings.shape[1]}")
     squares = np.einsum("nd,nd->n", encodings, encodings)
     query_squares = np.einsum("qd,qd->q", queries, queries)
-    squared = query_squares[:, np.newaxis] + squares - 2.0 * (queries @ encodings.T)
-    distances = -np.sqrt(np.maximum(squared, 0.0))
+    squared_distances = query_squares[:, np.newaxis] + squares - 2.0 * (queries @ encodings.T)
+    distances = -np.sqrt(np.maximum(squared_distances, 0.0))
     return np.asarray(distances if query.encoding.ndim > 1 else distances[0], np.float32)
 
 
@@ -153,9 +153,9 @@ def sum_listed(map_: Map, tables: NDArray[np.number]) -> NDArray[np.float32]:
     sums = np.empty((len(worth), n), np.float32)
     if len(worth) == 1 and n >= 2 * _IMAGES_WORTH_A_THREAD:
         half = n // 2
-        other = _second_core().submit(_sum_listed, map_.lists[:, half:], worth, sums[:, half:])
+        second_half = _second_core().submit(_sum_listed, map_.lists[:, half:], worth, sums[:, half:])
         _sum_listed(map_.lists[:, :half], worth, sums[:, :half])
-        other.result()
+        second_half.result()
     else:
         _sum_listed(map_.lists, worth, sums)
     return sums.reshape(*tables.shape[:-2], n)
