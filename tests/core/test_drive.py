@@ -139,9 +139,9 @@ def test_frames_of_one_stop_are_one_place():
         return np.concatenate([np.tile(stop, (100, 1)), scenery(rng, 60)])
 
     assert sum(verdict(rng, with_stop(), with_stop(), position_m=stands).accepted for _ in range(20)) <= 1
-    alone = verdict(rng, rng.normal(size=(124, 12)), rng.normal(size=(124, 12)), position_m=np.zeros(124))
-    assert (alone.accepted, alone.statistic, alone.significance) == (False, None, None)
-    assert f"share 1 places by their positions, and {LEAST_PLACES} are the least" in alone.why
+    of_one_stop = verdict(rng, rng.normal(size=(124, 12)), rng.normal(size=(124, 12)), position_m=np.zeros(124))
+    assert (of_one_stop.accepted, of_one_stop.statistic, of_one_stop.significance) == (False, None, None)
+    assert f"share 1 places by their positions, and {LEAST_PLACES} are the least" in of_one_stop.why
 
 
 @pytest.mark.parametrize(("n", "accepted"), [(0, False), (29, False), (30, True)])
@@ -216,7 +216,7 @@ def test_a_long_route_is_judged_always_alike():
 
 
 def test_pictures_of_nothing_and_of_a_camera_that_hung_are_told_by_name() -> None:
-    names = np.array([f"{at}.png" for at in range(12)])
+    names = np.array([f"{i}.png" for i in range(12)])
     encodings = np.random.default_rng(0).normal(size=(12, 5)).astype(np.float32)
     encodings[4:9] = encodings[3]  # it hung for five pictures, and stood for the last of them
     encodings[10:] = encodings[10]  # the lens was covered
@@ -236,7 +236,7 @@ def test_frames_unlike_all_others_are_told_by_name() -> None:
     rng = np.random.default_rng(0)
     encodings = rng.normal(size=(100, 400)).astype(np.float32)
     encodings[40:43] = rng.normal(0, 4, 400) + rng.normal(0, 0.1, (3, 400))
-    names = np.array([f"{at}.png" for at in range(100)])
+    names = np.array([f"{i}.png" for i in range(100)])
     drive = Drive(position_m=np.arange(100.0), encodings=encodings, frame_name=names)
     assert drive.picture_warnings("of the map") == [
         "3 of 100 pictures of the map are so unlike all others that they may show nothing of the route: glare, or the "

@@ -38,7 +38,7 @@ def seasons():
     return [place + noise * rng.normal(size=place.shape) for noise in (0.3, 0.1, 0.3)]
 
 
-def measured(drive, model):
+def with_dissimilarities(drive, model):
     return replace(drive, dissimilarities=EVALUATOR.dissimilarities(drive.encodings, model))
 
 
@@ -52,7 +52,7 @@ def snapshots(seasons):
         plan = MapPlan(relevance, LIST_LENGTH, ACTIONS_M, closed, same_route=True)
         if relevance is Relevance.COMPOSED:
             return compose_map(plan, first, second, second, N_LANDMARKS).map
-        return build_from_dissimilarities(plan, first, second, model, measured).map
+        return build_from_dissimilarities(plan, first, second, model, with_dissimilarities).map
 
     return functools.cache(make)
 

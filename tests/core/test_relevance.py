@@ -88,14 +88,14 @@ def test_live_statistics_start_as_the_maps_and_follow_the_views():
 def test_a_batch_of_views_says_what_each_says_alone(relevance, scene):
     map_ = a_map(relevance, scene["map"], 4, encodings=scene["map encodings"])
     views = Query(rank_landmarks(scene["query"]), scene["query"], scene["query encodings"])
-    alone = [map_.live_statistics] * 6
-    together = map_.live_statistics
+    single_live = [map_.live_statistics] * 6
+    batch_live = map_.live_statistics
     for _ in range(3):
-        together = together and replace(together, ranks=together.ranks.observing(views.ranks))
-        batch = relevances(map_, views, together)
+        batch_live = batch_live and replace(batch_live, ranks=batch_live.ranks.observing(views.ranks))
+        batch = relevances(map_, views, batch_live)
         for e in range(6):
-            alone[e] = alone[e] and alone[e].observing(views.at(e))
-            expected = relevances(map_, views.at(e), alone[e])
+            single_live[e] = single_live[e] and single_live[e].observing(views.at(e))
+            expected = relevances(map_, views.at(e), single_live[e])
             np.testing.assert_allclose(batch[e], expected, atol=1e-5)
             if relevance is not Relevance.BRUTE_FORCE:  # of which one matrix product rounds as it likes
                 assert np.array_equal(batch[e], expected)

@@ -121,8 +121,8 @@ def test_the_window_along_the_route_finds_what_looking_at_all_finds(seed, closed
     map_route = Route(np.sort(rng.integers(0, 200, 50)) / 10, closed)
     query = Route(np.sort(rng.integers(-10, 210, 20)) / 10)
     expected = [
-        np.flatnonzero(np.abs(map_route.offset_m(map_route.position_m, at)) <= tolerance_m).tolist()
-        for at in query.position_m
+        np.flatnonzero(np.abs(map_route.offset_m(map_route.position_m, position_m)) <= tolerance_m).tolist()
+        for position_m in query.position_m
     ]
     assert [ids.tolist() for ids in true_images_of(query, map_route, tolerance_m)] == expected
 

@@ -77,11 +77,11 @@ def test_landmarks_go_together_as_a_common_factor_says():
 
 def test_what_is_unusually_near_brings_its_likes_nearer():
     loadings = np.array([[0.9], [0.9], [0.0], [0.0], [0.0], [0.0]], np.float32)
-    alone, together = statistics_of(6), statistics_of(6, loadings=loadings)
+    independent, correlated = statistics_of(6), statistics_of(6, loadings=loadings)
     ranks = ranks_from_ranked_landmarks([0], 6)
-    assert together.view(ranks).z[1] < alone.view(ranks).z[1]
-    assert together.view(ranks).certainty[1] > alone.view(ranks).certainty[1]
-    assert together.view(ranks).z[2:] == pytest.approx(alone.view(ranks).z[2:])
+    assert correlated.view(ranks).z[1] < independent.view(ranks).z[1]
+    assert correlated.view(ranks).certainty[1] > independent.view(ranks).certainty[1]
+    assert correlated.view(ranks).z[2:] == pytest.approx(independent.view(ranks).z[2:])
 
 
 def test_all_ranks_are_known_or_none():
@@ -94,9 +94,9 @@ def test_all_ranks_are_known_or_none():
     no_ranks = Query.uninformative(7).ranks
     assert (statistics.view(no_ranks).z == 0).all()
     assert (statistics.view(no_ranks).certainty == 0).all()
-    unmoved = statistics.observing(no_ranks)
-    assert unmoved.mean == pytest.approx(statistics.mean)
-    assert unmoved.square == pytest.approx(statistics.square)
+    live = statistics.observing(no_ranks)
+    assert live.mean == pytest.approx(statistics.mean)
+    assert live.square == pytest.approx(statistics.square)
 
 
 def test_running_statistics_take_the_expected_moments():
@@ -114,10 +114,10 @@ def test_a_long_drive_of_short_lists_keeps_its_statistics_sane():
     """Views drawn as the statistics say, of which a tenth is sent: means and spreads stay where they were."""
     rng = np.random.default_rng(0)
     mean_scores = rng.normal(size=60)
-    drawn = mean_scores + 0.7 * rng.normal(size=(600, 60))
-    truth = LandmarkStatistics.of_map(rank_landmarks(drawn))
+    scores = mean_scores + 0.7 * rng.normal(size=(600, 60))
+    truth = LandmarkStatistics.of_map(rank_landmarks(scores))
     live = replace(truth, weight=20.0)
-    for row in drawn:
+    for row in scores:
         live = live.observing(ranks_from_ranked_landmarks(np.argsort(row)[:6].tolist(), 60))
     assert np.isfinite(live.mean).all()
     assert np.abs(live.mean - truth.mean).mean() < 0.15

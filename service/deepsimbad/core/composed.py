@@ -325,14 +325,9 @@ def _grow(
     dots: Any, squares: Any, cross: Any, ids: Any, base: Any, landmark: Any, depth: int, w: Any, product: Any, gram: Any
 ) -> None:
     """Replace the partial lists by those at `base`, each one landmark longer."""
-    n_lists = base.size
-    dots[:n_lists], squares[:n_lists], cross[:n_lists], ids[:n_lists] = (
-        dots[base],
-        squares[base],
-        cross[base],
-        ids[base],
-    )
-    for b in range(n_lists):
+    n = base.size
+    dots[:n], squares[:n], cross[:n], ids[:n] = dots[base], squares[base], cross[base], ids[base]
+    for b in range(n):
         k = landmark[b]
         dots[b] += w * product[k]
         squares[b] += w * (2 * cross[b, k] + w)

@@ -169,17 +169,17 @@ def test_views_that_lie_are_trusted_less(route):
 @pytest.mark.parametrize("kind", list(FilterKind))
 def test_standing_still_is_one_view_however_often_it_is_taken(kind, route):
     view = np.random.default_rng(3).normal(size=100) * 2
-    once = FILTERS[kind].uniform(route).updated(evidence_of(view), 0)
-    often = once
+    one_view = FILTERS[kind].uniform(route).updated(evidence_of(view), 0)
+    many_views = one_view
     for step in range(1, 100):
-        often = often.predicted(0.0, 0.0, step).updated(evidence_of(view, shared=1.0), step)
+        many_views = many_views.predicted(0.0, 0.0, step).updated(evidence_of(view, shared=1.0), step)
     entropy_of_many, entropy_of_one = (
-        -(mass[mass > 0] * np.log2(mass[mass > 0])).sum() for mass in (often.mass, once.mass)
+        -(mass[mass > 0] * np.log2(mass[mass > 0])).sum() for mass in (many_views.mass, one_view.mass)
     )
     assert entropy_of_many > entropy_of_one - 0.3, "it is no surer"
     if kind is FilterKind.GRID:
-        assert np.abs(often.mass - once.mass).sum() < 0.05
-    assert often.mass.argmax() == once.mass.argmax()
+        assert np.abs(many_views.mass - one_view.mass).sum() < 0.05
+    assert many_views.mass.argmax() == one_view.mass.argmax()
 
 
 # --- moves ---------------------------------------------------------------------------------------------------------
@@ -246,11 +246,11 @@ def test_a_move_equals_its_definition(closed, action, std):
 
 
 def test_what_leads_past_the_end_is_lost(route):
-    partly = holding(route, np.ones(100)).predicted(20.0, 1e-9, step=1)
-    assert partly.off_route == pytest.approx(0.2 * 0.98 + 0.8 * (1 - np.exp(-0.01)))
-    assert partly.mass[20:].sum() > 0.97
-    doubted = holding(route, np.eye(100)[95], lost=0.2).predicted(20.0, 0.3, step=1)
-    assert doubted.off_route > 0.8, "a robot that may be lost is refused no move"
+    belief = holding(route, np.ones(100)).predicted(20.0, 1e-9, step=1)
+    assert belief.off_route == pytest.approx(0.2 * 0.98 + 0.8 * (1 - np.exp(-0.01)))
+    assert belief.mass[20:].sum() > 0.97
+    doubtful_belief = holding(route, np.eye(100)[95], lost=0.2).predicted(20.0, 0.3, step=1)
+    assert doubtful_belief.off_route > 0.8, "a robot that may be lost is refused no move"
 
 
 @pytest.mark.parametrize("std", [1.0, 5.0])
@@ -264,8 +264,8 @@ def test_images_of_one_stop_share_what_arrives_there():
     route = Route(np.array([0.0, 1.0, 2.0, 2.0, 2.0, 3.0]))
     belief = holding(route, [0, 1.0, 0, 0]).predicted(1.0, 0.0, step=1)
     np.testing.assert_allclose(belief.mass, [0, 0, 1 / 3, 1 / 3, 1 / 3, 0], atol=1e-2)
-    stood = belief.predicted(0.0, 0.0, step=2)
-    np.testing.assert_allclose(stood.mass, belief.mass, atol=1e-9)
+    standing_belief = belief.predicted(0.0, 0.0, step=2)
+    np.testing.assert_allclose(standing_belief.mass, belief.mass, atol=1e-9)
 
 
 @pytest.mark.parametrize("n_gaps", [3, 20])

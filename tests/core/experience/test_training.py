@@ -92,23 +92,23 @@ def slow_training(world: TrainingWorld, config: NnqlConfig, closed: bool) -> np.
 def test_the_same_values_as_plain_loops(closed, known_share, actions_m):
     config = NnqlConfig(n_episodes=60, batch_episodes=1, motion_std_m=0.33, top_share=0.2, exploration=0.5, seed=3)
     world = random_world(config, closed, known_share, actions_m)
-    learnt, _ = train(world, config, lambda _: None)
+    q_values, _ = train(world, config, lambda _: None)
     expected = slow_training(world, config, closed)
     assert (expected > 1).any()
-    assert np.allclose(learnt, expected, rtol=1e-4, atol=1e-5)
+    assert np.allclose(q_values, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_seed_decides_and_threads_do_not():
     config = NnqlConfig(n_episodes=250, seed=7, motion_std_m=0.5)
     world = random_world(config)
-    alone, curve = train(world, config, lambda _: None)
+    q_values, curve = train(world, config, lambda _: None)
     with ThreadPoolExecutor(2) as pool:
-        together, same_curve = train(world, config, lambda _: None, pool)
-    assert np.array_equal(alone, together)
-    assert curve == same_curve
+        pool_q_values, pool_curve = train(world, config, lambda _: None, pool)
+    assert np.array_equal(q_values, pool_q_values)
+    assert curve == pool_curve
     assert len(curve.reward_share) == 3
-    other, _ = train(world, NnqlConfig(n_episodes=250, seed=8, motion_std_m=0.5), lambda _: None)
-    assert not np.array_equal(alone, other)
+    other_q_values, _ = train(world, NnqlConfig(n_episodes=250, seed=8, motion_std_m=0.5), lambda _: None)
+    assert not np.array_equal(q_values, other_q_values)
 
 
 def test_a_cancel_ends_training_between_two_batches():
@@ -128,8 +128,8 @@ def test_a_cancel_ends_training_between_two_batches():
 def test_no_episodes_teach_nothing():
     config = NnqlConfig(n_episodes=0)
     world = random_world(config)
-    learnt, curve = train(world, config, lambda _: None)
-    assert np.array_equal(learnt, initial_q_values(80, 3, config))
+    q_values, curve = train(world, config, lambda _: None)
+    assert np.array_equal(q_values, initial_q_values(80, 3, config))
     assert curve.reward_share == ()
     assert curve.greedy_reward_share == curve.random_reward_share
 
@@ -178,9 +178,9 @@ def telling_world(config: NnqlConfig) -> TrainingWorld:
 def test_where_only_every_tenth_place_tells_the_learnt_moves_find_it():
     config = NnqlConfig(n_episodes=1500, n_actions_per_episode=3, top_share=0.02, motion_std_m=0.0, n_neighbours=4)
     world = telling_world(config)
-    learnt, curve = train(world, config, lambda _: None)
+    q_values, curve = train(world, config, lambda _: None)
     assert curve.greedy_reward_share > curve.random_reward_share + 0.15
     starts = world.start_frames
-    greedy = walk_greedily(world, starts, learnt, config)
+    greedy = walk_greedily(world, starts, q_values, config)
     random = walk_greedily(world, starts, initial_q_values(300, 9, config), config)
     assert greedy.mean() < 0.7 * random.mean()

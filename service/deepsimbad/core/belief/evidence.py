@@ -111,10 +111,10 @@ def _news(
 
 @dataclass(frozen=True)
 class Doubt:
-    """What every filter knows besides places."""
+    """What both filters hold besides places: whether the robot is lost, and how far views are trusted."""
 
-    lost: NDArray[np.float64]  # [t] by trust, of what that trust believes
-    log_trust: NDArray[np.float64]  # [t] how well each has predicted the views so far
+    lost: NDArray[np.float64]  # [t] probability of being lost, by trust
+    log_trust: NDArray[np.float64]  # [t] logarithm of each trust's weight: how well it has predicted the views so far
     last: NDArray[np.float64] | None = None  # [n] values of the last view, carried along by the moves since
 
     @classmethod
@@ -125,7 +125,7 @@ class Doubt:
 
     @property
     def is_mixture(self) -> bool:
-        """Whether being lost is entered and left; to the paper's updates it stays as likely as at the start."""
+        """Whether a robot may get lost and be found; in the paper's updates it is lost as likely as at the start."""
         return self.lost.size > 1
 
     @cached_property

@@ -1,7 +1,7 @@
 """What a move does to a belief, for both filters: its error, where it may end, and who is lost on the way.
 
-A robot gets lost at a small rate a metre, and is then found anywhere. A move ends where an open route ends, within its
-error; only one whose whole error lies past the end is refused.
+A robot gets lost at a small rate a metre, and a lost one is found anywhere. A move ends where an open route ends,
+within its error; only one whose whole error lies past the end is refused.
 """
 
 from functools import lru_cache
