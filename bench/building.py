@@ -36,7 +36,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.planners import PlanningView, information_ahead, plan_by_experience
 from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.store.map_file import index_bytes, read_map, seal, table_bytes, write_map
 
 _DIM = 64  # of encodings whose number is all that counts
@@ -193,7 +193,7 @@ def _composed() -> tuple[Map, Query]:
         Drive(position_m=np.arange(NCLT_IMAGES) * SPACING_M, encodings=season.astype(np.float32)) for season in seasons
     )
     built = build(MapPlan(Relevance.COMPOSED, 4, ACTIONS_M), own, None, own, N_LANDMARKS, evaluator).map
-    return built, views_of(measured(other, built.landmark_model, evaluator))
+    return built, views_of(measure_drive(other, built.landmark_model, evaluator))
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from deepsimbad.evaluators.feature_l2 import squared_distances
 from deepsimbad.evaluators.registry import EvaluatorKind, evaluator_config, make_evaluator
 from deepsimbad.evaluators.trunk import Trunk
 from deepsimbad.jobs.build import encode_recording
-from deepsimbad.jobs.experiments.kept import kept_encodings
+from deepsimbad.jobs.experiments.cache import open_encoding_cache
 from deepsimbad.jobs.experiments.nbv import BLOCK_M
 from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad.jobs.experiments.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
@@ -203,9 +203,9 @@ class Drives:
             evaluator = KINDS[name].make(self.extractor) if is_l2 else TOLD[name].make(name)
             made_of = {"extractor": self.extractor} if is_l2 else {"kind": name}
             role = _name(source) + ("" if is_l2 else f"-{name}")
-            with kept_encodings(self._work, role, source=source, **made_of) as kept:
+            with open_encoding_cache(self._work, role, source=source, **made_of) as kept:
                 recording = open_source(source)
-                encoded = encode_recording(recording, evaluator, MAX_PIXELS, lambda _: None, kept=kept)
+                encoded = encode_recording(recording, evaluator, MAX_PIXELS, lambda _: None, encoding_cache=kept)
             self._encoded[source, name] = encoded.drive
         return self._encoded[source, name]
 

@@ -24,7 +24,7 @@ from deepsimbad.core.experience.training import TrainingWorld, Walk, train, walk
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.relevance import Relevance, UpdateRule
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build import build, measured, train_nnql, world_of
+from deepsimbad.jobs.build import build, measure_drive, train_nnql, world_of
 
 DRIVES = ("nr", "nq", "nq2")
 TRIPLETS = tuple(itertools.permutations(DRIVES))
@@ -61,7 +61,7 @@ class Triplet:
         drives = [Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in encodings]
         plan = MapPlan(self.setup.relevance, LIST_LENGTH, tuple(ACTIONS_M), same_route=True)
         built = build(plan, drives[1], drives[0], drives[0], N_LANDMARKS, evaluator)
-        return built, [measured(drive, built.map.landmark_model, evaluator) for drive in drives]
+        return built, [measure_drive(drive, built.map.landmark_model, evaluator) for drive in drives]
 
     def learn(self, live: str, config: NnqlConfig, pool: Executor) -> NDArray[np.float32]:
         """Q-values learnt from some live images; `held-out frames` and `landmark traverse` as a remap does."""

@@ -32,7 +32,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.evaluators.space import unit_vectors
-from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.build import build, measure_drive, views_of
 
 N_LANDMARKS, N_SENT = (128, 256, 300, 500), (8, 16, 32, 48)  # and as many as the budget holds
 N_BITS = (3, 4, 5, 8)  # a number of a unit encoding
@@ -73,7 +73,7 @@ class Drives:
 def ranked(drives: Drives, built: Map, m: int) -> list[PackedRanks]:
     """What a robot sends of every test frame, by its m nearest landmarks."""
     test = Drive(position_m=np.arange(float(len(drives.test))), encodings=drives.test)
-    ranks = views_of(measured(test, built.landmark_model, _EVALUATOR)).ranks
+    ranks = views_of(measure_drive(test, built.landmark_model, _EVALUATOR)).ranks
     return [PackedRanks(pack_ranked_landmarks(np.argsort(row)[:m].tolist(), built.n_landmarks)) for row in ranks]
 
 

@@ -20,7 +20,7 @@ from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.jobs.build import measured, views_of
+from deepsimbad.jobs.build import measure_drive, views_of
 from deepsimbad.jobs.experiments.vpr import moves_between, relevances_by_all
 
 _ROUNDS = 25  # of k-means
@@ -80,7 +80,7 @@ def netvlad_drives() -> dict[str, Drive]:
 def scored(built: Built, places: NDArray[np.float32], test: Drive) -> RetrievalScores:
     """One session over the test drive against restored places."""
     truth = true_images_of(test.route(), built.map.route, TOLERANCE)
-    views = views_of(measured(test, built.map.landmark_model, FeatureL2("none")))
+    views = views_of(measure_drive(test, built.map.landmark_model, FeatureL2("none")))
     rows = relevances_by_all(replace(built, places=places), views, moves_between(test), stateless=False)
     scorer = RetrievalScorer()
     for row, true_images in zip(rows, truth, strict=True):

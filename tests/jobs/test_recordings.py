@@ -13,8 +13,8 @@ from deepsimbad.errors import ImageTooLargeError, InvalidRouteError, InvalidScen
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
-from deepsimbad.jobs.experiments import kept as kept_module
-from deepsimbad.jobs.experiments.kept import kept_encodings
+from deepsimbad.jobs.experiments import cache as cache_module
+from deepsimbad.jobs.experiments.cache import open_encoding_cache
 from deepsimbad.jobs.experiments.truth import read_ground_truth
 from deepsimbad_client.recordings import Frame, Recording
 from deepsimbad_client.recordings.annotations import as_taken
@@ -64,30 +64,30 @@ def test_the_readers_own_count_is_kept(folder, judge):
 def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, judge, tmp_path_factory):
     cv2.imwrite(str(folder / "4.png"), np.zeros((90, 160, 3), np.uint8))
     recording, out = open_source(str(folder)), tmp_path_factory.mktemp("out")
-    with kept_encodings(out, "queries", source=str(folder)) as kept:
-        first = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, kept=kept)
-    with kept_encodings(out, "queries", source=str(folder)) as kept:
-        again = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, kept=kept)
+    with open_encoding_cache(out, "queries", source=str(folder)) as kept:
+        first = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=kept)
+    with open_encoding_cache(out, "queries", source=str(folder)) as kept:
+        again = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=kept)
     assert again.encode_ms is None, "nothing was encoded"
     assert again.drive.shows_nothing.tolist() == [False, False, False, True, False]
     assert first.drive.shows_nothing.tolist() == again.drive.shows_nothing.tolist()
 
 
 def test_a_run_that_is_killed_has_kept_what_it_encoded_now_and_then(tmp_path, monkeypatch):
-    monkeypatch.setattr(kept_module, "_LEAST_NEW", 3)
+    monkeypatch.setattr(cache_module, "_LEAST_NEW", 3)
     on_disk = []
-    with kept_encodings(tmp_path, "queries", source="drive") as kept:
+    with open_encoding_cache(tmp_path, "queries", source="drive") as kept:
         for frame in range(17):
             kept[str(frame)] = np.full(4, frame, np.float32), False
-            with kept_encodings(tmp_path, "queries", source="drive") as again:
+            with open_encoding_cache(tmp_path, "queries", source="drive") as again:
                 on_disk.append(len(again))
     assert on_disk == [0, 0, *[3] * 3, *[6] * 3, *[9] * 3, *[12] * 3, *[15] * 3]
-    monkeypatch.setattr(kept_module, "_NEW_SHARE", 1)
-    with kept_encodings(tmp_path, "queries", source="drive") as kept:
+    monkeypatch.setattr(cache_module, "_NEW_SHARE", 1)
+    with open_encoding_cache(tmp_path, "queries", source="drive") as kept:
         assert len(kept) == 17
         for frame in range(17, 34):
             kept[str(frame)] = np.full(4, frame, np.float32), False
-            with kept_encodings(tmp_path, "queries", source="drive") as again:
+            with open_encoding_cache(tmp_path, "queries", source="drive") as again:
                 assert len(again) == (34 if frame == 33 else 17), "twice as many before they are written anew"
 
 

@@ -179,7 +179,7 @@ async def post_remap(
     job_id = id_under_key(request, REMAP, domain, idempotency_key)
 
     def submit() -> JobAnswer:
-        earlier_job = running.runner.made_before(job_id, config)
+        earlier_job = running.runner.earlier_job(job_id, config)
         if earlier_job is not None:
             return JobAnswer.model_validate(earlier_job)
         record = running.catalog.domain(domain)
@@ -237,7 +237,7 @@ async def post_experience(
                 labels = {"domain": domain, "session_id": body.session_id}
                 log.warning("truths could not be ranked: %s", error, extra=labels)
 
-    job = await run_sync(running.runner.made_before, job_id, config) or await learn()
+    job = await run_sync(running.runner.earlier_job, job_id, config) or await learn()
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
     return JobAnswer.model_validate(job)
 

@@ -38,7 +38,7 @@ from deepsimbad.jobs.build import EncodedRecording, encode_recording
 from deepsimbad.jobs.experiments.calibration import VIEWS, CalibrationConfig, calibration_stages, run_calibration
 from deepsimbad.jobs.experiments.nbv import NbvConfig, NbvReport, nbv_stages, run_nbv
 from deepsimbad.jobs.experiments.passive import WINDOWS, PassiveScores
-from deepsimbad.jobs.experiments.truth import known_drives, read_ground_truth
+from deepsimbad.jobs.experiments.truth import read_ground_truth, test_drive_warnings
 from deepsimbad.jobs.experiments.vpr import RANKS, VprConfig, VprReport, run_vpr, vpr_stages
 from deepsimbad.jobs.fitting import Pictures, RecordingPictures
 from deepsimbad.jobs.progress import Progress
@@ -262,7 +262,7 @@ class _Triplet:
             "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
         }
         n_landmarks = fitting_number(asked["n_landmarks"], landmarks.n_frames, _N_LANDMARKS)
-        warnings = known_drives(test, landmarks=landmarks, training=training)
+        warnings = test_drive_warnings(test, landmarks=landmarks, training=training)
         for role, recording, encoded in zip(_ROLES, opened, recordings, strict=True):
             warnings += [f"{role}: {remark}" for remark in recording.remarks]
             warnings += [f"{role}: {line}" for line in left_out_lines(encoded.left_out_names, verbose=False)]

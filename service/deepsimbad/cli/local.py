@@ -40,7 +40,7 @@ from deepsimbad.evaluators.image_files import MEDIA_TYPES, ImageFile
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.evaluators.scenes import Scene, read_observation
 from deepsimbad.jobs.build import EncodedBlock, encode_recording
-from deepsimbad.jobs.fitting import RecordingPictures, learns
+from deepsimbad.jobs.fitting import RecordingPictures, fitting_of
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import (
     DEFAULT_LIST_LENGTH,
@@ -236,7 +236,7 @@ def _stages(
     if keeps_pictures:
         reading |= {f"keep pictures of {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
     return reading | remap_stages(
-        config, n_frames["training"], n_frames.get("landmarks", 0), dim, learns(measure, config.relevance)
+        config, n_frames["training"], n_frames.get("landmarks", 0), dim, fitting_of(measure, config.relevance)
     )
 
 

@@ -31,7 +31,7 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
-from deepsimbad.jobs.experiments.kept import KeptResults, drive_digest, kept_encodings
+from deepsimbad.jobs.experiments.cache import ResultCache, drive_digest, open_encoding_cache
 from deepsimbad.jobs.experiments.paper import (
     SEASONS,
     TRIPLETS,
@@ -211,12 +211,12 @@ def _encoded(
     shares = Shares(
         lambda _, share: on_progress(share), {each: len(drive.frames) for each, drive in recordings.items()}
     )
-    results, encoded = KeptResults(out / "results", made_of), dict[str, EncodedRecording]()
+    results, encoded = ResultCache(out / "results", made_of), dict[str, EncodedRecording]()
 
     def encode(season: str) -> None:
         report, date = shares.report(season), SEASONS[season]
-        with kept_encodings(out / "encodings", date, source=date, **made_of) as kept:
-            drive = encode_recording(recordings[season], evaluator, max_pixels, report, kept=kept)
+        with open_encoding_cache(out / "encodings", date, source=date, **made_of) as kept:
+            drive = encode_recording(recordings[season], evaluator, max_pixels, report, encoding_cache=kept)
         of_drive = drive_digest(drive.drive)
         took = results.get(f"{season}-encode", lambda: {"ms": drive.encode_ms}, digest=of_drive)  # of who encoded it
         encoded[season] = replace(drive, encode_ms=took["ms"])

@@ -31,9 +31,9 @@ from deepsimbad.errors import ImageTooLargeError, InvalidImageError
 from deepsimbad.evaluators.image import decode_image, picture_size
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
 from deepsimbad.jobs.build import EncodedRecording, encode_recording
-from deepsimbad.jobs.experiments.kept import kept_encodings
+from deepsimbad.jobs.experiments.cache import open_encoding_cache
 from deepsimbad.jobs.experiments.trial import RECALL_RANKS, TRIAL_STAGES, Stretch, TrialReport, run_trial
-from deepsimbad.jobs.experiments.truth import known_drives
+from deepsimbad.jobs.experiments.truth import test_drive_warnings
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U
 from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad_client.errors import BrokenFrameError
@@ -102,9 +102,11 @@ def try_(
                 **evaluator.as_dict(),
                 **reading,
             }
-            with kept_encodings(out, role, **made_of) as kept:
+            with open_encoding_cache(out, role, **made_of) as kept:
                 encoded[role] = encode_recording(
-                    *(recording, measure, settings.max_pixels, progress.update), kept=kept, allow_missing=allow_missing
+                    *(recording, measure, settings.max_pixels, progress.update),
+                    encoding_cache=kept,
+                    allow_missing=allow_missing,
                 )
         drives = {role: each.drive for role, each in encoded.items()}
         truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)
@@ -126,7 +128,7 @@ def try_(
         )
         others = {role: drive for role, drive in drives.items() if role != "queries"}
         shown = [why for role in ("database", "queries") for why in drives[role].picture_warnings(f"of the {role}")]
-        document["warnings"] = [*known_drives(drives["queries"], **others), *report.warnings, *shown]
+        document["warnings"] = [*test_drive_warnings(drives["queries"], **others), *report.warnings, *shown]
         progress.stage("pictures")
         places, views = (Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries"))
         document["page"] = str(write_page(out / "index.html", document, report, places, views, progress.update))

@@ -67,15 +67,16 @@ def refuse_known_traverse(active: MapRecord, name: str) -> None:
 
 
 def seasons_in(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str | None, bool]:
-    """The traverses that a map is made of, by its configuration and metrics in the catalog; None: of another server.
+    """The traverses that a map is made of, by its configuration and metrics in the catalog, training traverse first.
 
-    The first is the training traverse; whether each sees the same at one place as that one.
+    Returns:
+        Name (None: a traverse of another server) -> whether it sees the same at one place as the training traverse.
     """
     names = {config["training_traverse"]: True}
-    second = metrics.get("second_season") or {}
-    if second.get("accepted"):
-        names[second.get("traverse", config["landmark_traverse"])] = True
-    return names | {added["traverse"]: added.get("fused", False) for added in config.get("appended", ())}
+    verdict = metrics.get("second_season") or {}
+    if verdict.get("accepted"):
+        names[verdict.get("traverse", config["landmark_traverse"])] = True
+    return names | {entry["traverse"]: entry.get("fused", False) for entry in config.get("appended", ())}
 
 
 @dataclass(frozen=True)
@@ -84,13 +85,13 @@ class KnownDrives:
 
     seasons: tuple[Drive, ...]  # whose frames are images, or fused into them; the first is the training traverse
     agree: NDArray[np.bool_]  # which of them see the same at one place as the first
-    source: NDArray[np.int64]  # [n, 2] of every image, which of them and which frame of it
-    candidates: Drive | None  # that landmarks were chosen from; None: unknown
+    source: NDArray[np.int64]  # [n, 2] (season, frame of it) of every map image
+    candidates: Drive | None  # the drive that landmarks were chosen from; None: unknown
     halves: tuple[int, ...] = ()  # see `principal_directions`
 
     @classmethod
     def of(cls, map_: Map, seasons: Sequence[tuple[Drive, bool]], candidates: Drive | None) -> Self | None:
-        """By the digests of the frames; None where some image's frame is in none of them."""
+        """Find every map image's frame by its digest; None where one is in none of the drives."""
         if map_.frame_digest is None:
             return None
         places = {
@@ -98,148 +99,165 @@ class KnownDrives:
             for number, (drive, _) in enumerate(seasons)
             for frame, digest in enumerate(drive.digests().tolist())
         }
-        source = [places.get(digest, (-1, -1)) for digest in map_.frame_digest.tolist()]
-        found = np.array(source, np.int64).reshape(-1, 2)
+        sources = [places.get(digest, (-1, -1)) for digest in map_.frame_digest.tolist()]
+        source_array = np.array(sources, np.int64).reshape(-1, 2)
         drives, agree = zip(*seasons, strict=True)
-        return None if (found < 0).any() else cls(drives, np.array(agree), found, candidates)
+        return None if (source_array < 0).any() else cls(drives, np.array(agree), source_array, candidates)
 
     def fusable(self, places: NDArray[np.int64], number: int | None = None) -> NDArray[np.int64]:
-        """Those pairs (map image, frame) whose image is not of the same season, `number`, and agrees with it."""
+        """Of the pairs (map image, frame) of season `number` (None: a new one), those whose image agrees with it.
+
+        An image of that season itself has nothing to fuse.
+        """
         season = self.source[places[:, 0], 0]
         is_fusable = self.agree[season] & (number is None or self.agree[number]) & (season != number)
         return np.asarray(places[is_fusable], np.int64)
 
     def basis(self, map_: Map) -> tuple[NDArray[np.float32] | None, NDArray[np.float64] | None]:
-        """What encodings were projected by before a season's changes counted less, and by what they count less.
+        """Split a map's projection into what came before a season's changes counted less, and what lets them.
 
         Returns:
-            [d, k], None where d = k; and P [k, k], None where the two cannot be told apart any more.
+            [d, k] principal directions, None where d = k; and P [k, k], None where the two cannot be told apart.
         """
-        whole = map_.landmark_model.get("projection")
+        projection = map_.landmark_model.get("projection")
         drives = {id(drive): drive.encodings for drive in (self.seasons[0], self.candidates) if drive is not None}
         directions = principal_directions(*drives.values(), halves=self.halves)
-        if directions is None or whole is None:
+        if directions is None or projection is None:
             k = self.seasons[0].encoding_dim
-            return None, np.eye(k) if whole is None else np.asarray(whole, np.float64)
-        whitening = np.linalg.lstsq(directions.astype(np.float64), np.asarray(whole, np.float64), rcond=None)[0]
-        is_whole = np.allclose(directions @ whitening, whole, atol=1e-3 * float(np.abs(whole).max()))
-        return (directions, whitening) if is_whole else (whole, None)
+            return None, np.eye(k) if projection is None else np.asarray(projection, np.float64)
+        whitening = np.linalg.lstsq(directions.astype(np.float64), np.asarray(projection, np.float64), rcond=None)[0]
+        is_split = np.allclose(directions @ whitening, projection, atol=1e-3 * float(np.abs(projection).max()))
+        return (directions, whitening) if is_split else (projection, None)
 
 
 def known_drives(
     catalog: Catalog, domain: DomainRecord, map_: Map, drive: Drive, read: Callable[[str], Drive]
 ) -> KnownDrives | str:
-    """What a domain's active map is made of, as far as it is still stored; else in a sentence why nothing can be fused.
+    """The drives that a domain's active map is made of, or in a sentence why nothing can be fused into it.
 
     Args:
-        drive: The one that is to be fused.
+        drive: The drive that is to be fused.
         read: Reads a traverse of the domain.
     """
     active = catalog.map(domain.name, domain.active_version or 0)
     if map_.relevance is not Relevance.COMPOSED:
         return f"places are fused in maps for composed alone, and this one is for {map_.relevance}"
     names, landmarks = seasons_in(active.config, active.metrics), active.config["landmark_traverse"]
-    stored = Traverse.list(catalog.data_dir, domain.name)
-    if gone := [name for name in names if name not in stored]:
-        return f"of the drives that the map is made of {gone[0] or 'those of another server'} are not stored here"
+    stored_names = Traverse.list(catalog.data_dir, domain.name)
+    if missing_names := [name for name in names if name not in stored_names]:
+        return (
+            f"of the drives that the map is made of {missing_names[0] or 'those of another server'} are not stored here"
+        )
     drives = [(read(name), agrees) for name, agrees in names.items() if name is not None]
-    if any(known.encoding_dim != drive.encoding_dim for known, _ in drives):
+    if any(season.encoding_dim != drive.encoding_dim for season, _ in drives):
         return "the drives that the map is made of come from another encoder by now"
     candidates = drives[0][0] if active.metrics.get("landmarks") == TRAINING else None
-    if active.metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored:
+    if active.metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored_names:
         candidates = read(landmarks)
     return KnownDrives.of(map_, drives, candidates) or "the drives that the map is made of hold other frames by now"
 
 
 @dataclass(frozen=True)
-class Fused:
-    """A map with one drive more, and what it is checked by."""
+class FusedMap:
+    """A map with one drive more, and what `without` makes it anew from."""
 
     map: Map
     base: Map  # before new images
     drive: Drive
-    new: NDArray[np.int64]  # frames that became images
+    new_frames: NDArray[np.int64]  # frames that became images
     landmarks: NDArray[np.float32]  # [r, k] before they were moved to what the drive saw
-    before: NDArray[np.float32]  # [n, k] sums over the earlier seasons
+    season_sums: NDArray[np.float32]  # [n, k] sums over the earlier seasons
     u: NDArray[np.float32]  # [m, k] of the drive
     pairs: NDArray[np.int64]  # [p, 2] (map image, frame)
 
     def without(self, withheld: NDArray[np.int64]) -> Map:
-        """The same map, had the drive's withheld frames not been fused."""
-        others = self.pairs[~np.isin(self.pairs[:, 1], withheld)]
-        places = unit(self.before + _season(self.u, others, self.base.n_images))
-        learnt = learnt_landmarks(places, self.landmarks, self.base.list_length)
-        base = replace(self.base, landmark_model={**self.base.landmark_model, "prototypes": learnt})
+        """The map as it would be without the drive's withheld frames."""
+        pairs = self.pairs[~np.isin(self.pairs[:, 1], withheld)]
+        places = unit(self.season_sums + _season(self.u, pairs, self.base.n_images))
+        landmarks = learnt_landmarks(places, self.landmarks, self.base.list_length)
+        base = replace(self.base, landmark_model={**self.base.landmark_model, "prototypes": landmarks})
         return _with_new(
-            replace(base, lists=_lists(base, places)), self.drive, self.new, _lists(base, self.u[self.new])
+            replace(base, lists=_lists(base, places)),
+            self.drive,
+            self.new_frames,
+            _lists(base, self.u[self.new_frames]),
         )
 
 
-def fuse(map_: Map, known: KnownDrives, drive: Drive, same_route: bool | None) -> tuple[Fused | None, SameRoute]:
+def fuse(
+    map_: Map, known_drives: KnownDrives, drive: Drive, same_route: bool | None
+) -> tuple[FusedMap | None, SameRoute]:
     """The map with a drive fused into it, None where that is not of the same route; and the verdict.
 
     Args:
         map_: A `composed` map.
         same_route: False: it is said not to be; else its positions count along the map's route, and views decide.
     """
-    basis, whitening = known.basis(map_)
-    seasons = (*known.seasons, drive)
+    basis, whitening = known_drives.basis(map_)
+    seasons = (*known_drives.seasons, drive)
     rows = [described(season.encodings, Moments.of(season.encodings), basis) for season in seasons]
-    own_rows = np.stack([rows[season][frame] for season, frame in known.source.tolist()])
+    map_rows = np.stack([rows[season][frame] for season, frame in known_drives.source.tolist()])
     prototypes = np.asarray(map_.landmark_model["prototypes"], np.float32)
-    unknown = np.full(map_.n_images, np.nan)
-    own = Drive(
+    unknown_m = np.full(map_.n_images, np.nan)
+    map_drive = Drive(
         position_m=map_.position_m,
-        x_m=unknown if map_.x_m is None else map_.x_m,
-        y_m=unknown if map_.y_m is None else map_.y_m,
-        encodings=own_rows,
-        dissimilarities=_dissimilarities(own_rows, whitening, prototypes),
+        x_m=unknown_m if map_.x_m is None else map_.x_m,
+        y_m=unknown_m if map_.y_m is None else map_.y_m,
+        encodings=map_rows,
+        dissimilarities=_dissimilarities(map_rows, whitening, prototypes),
     )
-    seen_now = replace(drive, dissimilarities=_dissimilarities(rows[-1], whitening, prototypes))
+    measured_drive = replace(drive, dissimilarities=_dissimilarities(rows[-1], whitening, prototypes))
     is_same = same_route is not False
-    season, _, verdict = second_season(own, map_.closed, drive, is_same, lambda _: seen_now)
+    season, _, verdict = second_season(map_drive, map_.closed, drive, is_same, lambda _: measured_drive)
     if season is None:
         return None, verdict
 
     pairs = [
-        known.fusable(same_places(earlier.route(), map_.route), number) for number, earlier in enumerate(known.seasons)
+        known_drives.fusable(same_places(earlier.route(), map_.route), number)
+        for number, earlier in enumerate(known_drives.seasons)
     ]
-    pairs.append(known.fusable(season.places))
+    pairs.append(known_drives.fusable(season.places))
     if not pairs[-1].size:
         return None, replace(
             verdict, accepted=False, why="all that it saw again are images of drives that agree with none"
         )
     plan = MapPlan(Relevance.COMPOSED, map_.list_length, tuple(map_.actions_m.tolist()), map_.closed, is_same)
     if whitening is not None and covers(map_.position_m, np.concatenate(pairs)[:, 0]):
-        seen_rows = np.concatenate([row[places[:, 1]] for row, places in zip(rows, pairs, strict=True)])
-        learnt = within_place_whitening(seen_rows, own_rows[np.concatenate(pairs)[:, 0]])
-        prototypes = unit(prototypes @ np.linalg.solve(whitening, learnt.astype(np.float64)))
-        whitening = learnt.astype(np.float64)
-        projection: NDArray[np.float32] | None = np.asarray(learnt if basis is None else basis @ learnt, np.float32)
+        frame_rows = np.concatenate([row[places[:, 1]] for row, places in zip(rows, pairs, strict=True)])
+        new_whitening = within_place_whitening(frame_rows, map_rows[np.concatenate(pairs)[:, 0]])
+        prototypes = unit(prototypes @ np.linalg.solve(whitening, new_whitening.astype(np.float64)))
+        whitening = new_whitening.astype(np.float64)
+        projection: NDArray[np.float32] | None = np.asarray(
+            new_whitening if basis is None else basis @ new_whitening, np.float32
+        )
     else:
         projection = map_.landmark_model.get("projection")
 
     u = [_units(row, whitening) for row in rows]
-    before = _units(own_rows, whitening)
-    for units, shared in zip(u[:-1], pairs[:-1], strict=True):
-        before = before + _season(units, shared, map_.n_images)
-    places = unit(before + _season(u[-1], pairs[-1], map_.n_images))
-    before_it, prototypes = prototypes, learnt_landmarks(places, prototypes, map_.list_length)
-    usual = Moments.of(*(other.encodings for other in seasons))
-    model = {**map_.landmark_model, "prototypes": prototypes, "usual": usual.mean_std()}
+    season_sums = _units(map_rows, whitening)
+    for units, places_seen in zip(u[:-1], pairs[:-1], strict=True):
+        season_sums = season_sums + _season(units, places_seen, map_.n_images)
+    places = unit(season_sums + _season(u[-1], pairs[-1], map_.n_images))
+    initial_landmarks, prototypes = prototypes, learnt_landmarks(places, prototypes, map_.list_length)
+    moments = Moments.of(*(season_drive.encodings for season_drive in seasons))
+    model = {**map_.landmark_model, "prototypes": prototypes, "usual": moments.mean_std()}
     model |= {} if projection is None else {"projection": projection}
-    own = replace(own, dissimilarities=_dissimilarities(own_rows, whitening, prototypes))
-    made = composed_map(plan, own, places, usual, model)
-    rehearsal = replace(made, landmark_model={**model, "prototypes": before_it})
-    rehearsal = replace(rehearsal, lists=_lists(rehearsal, unit(before)))
-    own_before, seen_before = (_dissimilarities(row, whitening, before_it) for row in (own_rows, rows[-1]))
-    season = SecondSeason(seen_before, pairs[-1])
-    made, _ = taught(made, rehearsal, own_before, _dissimilarities(places, None, prototypes), season, seasons)
-    arrays: dict[str, Any] = dict(made.arrays())
+    map_drive = replace(map_drive, dissimilarities=_dissimilarities(map_rows, whitening, prototypes))
+    fused_map = composed_map(plan, map_drive, places, moments, model)
+    rehearsal = replace(fused_map, landmark_model={**model, "prototypes": initial_landmarks})
+    rehearsal = replace(rehearsal, lists=_lists(rehearsal, unit(season_sums)))
+    map_dissimilarities, drive_dissimilarities = (
+        _dissimilarities(row, whitening, initial_landmarks) for row in (map_rows, rows[-1])
+    )
+    season = SecondSeason(drive_dissimilarities, pairs[-1])
+    fused_map, _ = taught(
+        fused_map, rehearsal, map_dissimilarities, _dissimilarities(places, None, prototypes), season, seasons
+    )
+    arrays: dict[str, Any] = dict(fused_map.arrays())
     base = replace(map_, landmark_model=model, **arrays)
-    new = np.setdiff1d(np.arange(drive.n_frames), pairs[-1][:, 1])
-    longer = _with_new(base, drive, new, _lists(base, u[-1][new]))
-    return Fused(longer, base, drive, new, before_it, before, u[-1], pairs[-1]), verdict
+    new_frames = np.setdiff1d(np.arange(drive.n_frames), pairs[-1][:, 1])
+    longer_map = _with_new(base, drive, new_frames, _lists(base, u[-1][new_frames]))
+    return FusedMap(longer_map, base, drive, new_frames, initial_landmarks, season_sums, u[-1], pairs[-1]), verdict
 
 
 def _units(rows: NDArray[np.float32], whitening: NDArray[np.float64] | None) -> NDArray[np.float32]:
@@ -253,18 +271,18 @@ def _dissimilarities(
 
 
 def _season(u: NDArray[np.float32], places: NDArray[np.int64], n_images: int) -> NDArray[np.float32]:
-    """[n, k] what a season adds to every place: the direction of its frames there, weighted."""
-    seen = np.zeros((n_images, u.shape[1]), np.float32)
-    np.add.at(seen, places[:, 0], u[places[:, 1]])
-    return np.asarray(SECOND_SEASON_WEIGHT * unit(seen), np.float32)
+    """What a season adds to every place, [n, k]: the weighted direction of its frames there."""
+    sums = np.zeros((n_images, u.shape[1]), np.float32)
+    np.add.at(sums, places[:, 0], u[places[:, 1]])
+    return np.asarray(SECOND_SEASON_WEIGHT * unit(sums), np.float32)
 
 
 def _lists(map_: Map, places: NDArray[np.float32]) -> NDArray[np.uint16]:
     return compose(places, np.asarray(map_.landmark_model["prototypes"], np.float32), map_.list_length)
 
 
-def _with_new(map_: Map, drive: Drive, new: NDArray[np.int64], lists: NDArray[np.uint16]) -> Map:
-    return with_frames(map_, drive.at(new), lists) if new.size else map_
+def _with_new(map_: Map, drive: Drive, new_frames: NDArray[np.int64], lists: NDArray[np.uint16]) -> Map:
+    return with_frames(map_, drive.at(new_frames), lists) if new_frames.size else map_
 
 
 def append_drive(map_: Map, drive: Drive) -> Map:
@@ -285,31 +303,35 @@ def append_drive(map_: Map, drive: Drive) -> Map:
     Raises:
         InvalidRouteError: The new frames go backwards.
     """
-    usual, ranks_of_frames = map_.live_statistics, rank_landmarks(measured_dissimilarities(drive))
+    map_statistics, ranks_of_frames = map_.live_statistics, rank_landmarks(measured_dissimilarities(drive))
     scores: NDArray[np.floating] = ranks_of_frames
-    pooled: dict[str, Any] = {}
-    if usual is not None:
-        own = LandmarkStatistics.of_map(ranks_of_frames)
-        scores = usual.ranks.pooled(usual.ranks.weight, own, drive.n_frames).standardise(ranks_of_frames)
-        ranks = usual.ranks.pooled(map_.n_images, own, drive.n_frames)
-        pooled["statistics"] = np.stack([ranks.mean, ranks.std])
-    if usual is not None and usual.encodings is not None:
-        own_encodings, model = Moments.counted(drive.encodings), map_.landmark_model
-        soon_own = usual.encodings.pooled(usual.encodings.weight, own_encodings, drive.n_frames)
-        u = described(drive.encodings, soon_own, model.get("projection"))
+    fields: dict[str, Any] = {}
+    if map_statistics is not None:
+        drive_ranks = LandmarkStatistics.of_map(ranks_of_frames)
+        scores = map_statistics.ranks.pooled(map_statistics.ranks.weight, drive_ranks, drive.n_frames).standardise(
+            ranks_of_frames
+        )
+        ranks = map_statistics.ranks.pooled(map_.n_images, drive_ranks, drive.n_frames)
+        fields["statistics"] = np.stack([ranks.mean, ranks.std])
+    if map_statistics is not None and map_statistics.encodings is not None:
+        drive_moments, model = Moments.counted(drive.encodings), map_.landmark_model
+        moments = map_statistics.encodings.pooled(map_statistics.encodings.weight, drive_moments, drive.n_frames)
+        u = described(drive.encodings, moments, model.get("projection"))
         lists = compose(u, model["prototypes"], map_.list_length)
-        of_all = usual.encodings.pooled(map_.n_images, own_encodings, drive.n_frames).mean_std()
-        pooled |= {"usual_encoding": of_all, "landmark_model": {**model, "usual": of_all}}
-        if usual.products is not None:
-            own_products = Moments.counted(u @ np.asarray(model["prototypes"], np.float32).T)
-            pooled["usual_product"] = usual.products.pooled(map_.n_images, own_products, drive.n_frames).mean_std()
+        usual_encoding = map_statistics.encodings.pooled(map_.n_images, drive_moments, drive.n_frames).mean_std()
+        fields |= {"usual_encoding": usual_encoding, "landmark_model": {**model, "usual": usual_encoding}}
+        if map_statistics.products is not None:
+            drive_products = Moments.counted(u @ np.asarray(model["prototypes"], np.float32).T)
+            fields["usual_product"] = map_statistics.products.pooled(
+                map_.n_images, drive_products, drive.n_frames
+            ).mean_std()
     else:
         lists = nearest_landmarks(scores, map_.list_length)
-    return replace(with_frames(map_, drive, lists), **pooled)
+    return replace(with_frames(map_, drive, lists), **fields)
 
 
 def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
-    """With frames of known lists [h, m] among the images; each knows of its place what the nearest old one does."""
+    """The map with a drive's frames of lists [h, m] among its images; the nearest image gives all else they need."""
     route = drive.route(map_.closed)
     nearest, is_near = nearest_known(map_, route.position_m)
     q_values, bits = map_.q_values, map_.view_bits
@@ -343,7 +365,7 @@ def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[n
 
 
 def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions as the route counts them; only what lies outside a closed one's first turn is turned."""
+    """Positions [m] as the route counts them: those outside a closed route's first turn are wrapped into it."""
     route = map_.route
     ahead_m = position_m - route.start_m
     inside = (ahead_m >= 0) & (ahead_m < route.length_m)
@@ -351,31 +373,32 @@ def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def camera_domain(catalog: Catalog, camera_of: str, domain: DomainRecord) -> DomainRecord:
-    """The other domain that a camera is told to be of.
+    """The other domain that `camera_of` names.
 
     Raises:
-        UnknownDomainError: There is none such.
+        UnknownDomainError: There is no such domain.
         InvalidMapConfigError: It is the domain itself, or has another evaluator.
     """
-    other = catalog.domain(camera_of)
-    if other.name == domain.name:
+    camera_record = catalog.domain(camera_of)
+    if camera_record.name == domain.name:
         raise InvalidMapConfigError(f"camera_of names domain {camera_of} itself: name one of another route")
-    if other.evaluator != domain.evaluator:
+    if camera_record.evaluator != domain.evaluator:
         raise InvalidMapConfigError(
             f"domain {camera_of} has another evaluator than {domain.name}: what it learnt says nothing here",
-            evaluator=other.evaluator,
+            evaluator=camera_record.evaluator,
         )
-    return other
+    return camera_record
 
 
-def seen_twice(catalog: Catalog, camera_of: str, domain: DomainRecord, training: Drive) -> tuple[SeenTwice, ...]:
-    """What the camera of another domain saw twice there, for a map whose own route it saw in one season.
+def camera_seasons(catalog: Catalog, camera_of: str, domain: DomainRecord, training: Drive) -> tuple[SeenTwice, ...]:
+    """The seasons that the camera of another domain saw there, for a map whose own route it saw in one.
 
-    Every further season of that domain's active map beside its first, from the drives that it is made of.
+    They are those of that domain's active map, every one but the first beside the first.
 
     Args:
         camera_of: The other domain.
-        domain, training: Whose map is made, and from which drive.
+        domain: The domain whose map is made.
+        training: The drive that it is made from.
 
     Raises:
         UnknownDomainError, NoActiveMapError: There is no such domain or map.
@@ -390,26 +413,27 @@ def seen_twice(catalog: Catalog, camera_of: str, domain: DomainRecord, training:
     its_map = f"map {active.version} of domain {camera_of}"
     if len(names) < 2:
         raise InvalidMapConfigError(f"{its_map} knows no second season: map it from two drives of its route first")
-    stored = Traverse.list(catalog.data_dir, camera_of)
-    if gone := [name for name in names if name not in stored]:
+    stored_names = Traverse.list(catalog.data_dir, camera_of)
+    if missing_names := [name for name in names if name not in stored_names]:
         raise InvalidMapConfigError(
-            f"{its_map} is made of traverse {gone[0]}, which is not in this data directory: map it anew here first"
+            f"{its_map} is made of traverse {missing_names[0]}, which is not in this data directory: map it anew here "
+            "first"
         )
     drives = []
     for name in names:
         with Traverse.open(catalog.data_dir, camera_of, name) as traverse:
             drives.append(traverse.read())
-        what = f"traverse {name} of domain {camera_of}"
+        label = f"traverse {name} of domain {camera_of}"
         if drives[-1].encoding_dim != training.encoding_dim:
             raise InvalidEncodingError(
-                f"{what} holds encodings of {drives[-1].encoding_dim} numbers, not of {training.encoding_dim}"
+                f"{label} holds encodings of {drives[-1].encoding_dim} numbers, not of {training.encoding_dim}"
             )
-        WeightsDifferError.check(what, drives[-1].weights_sha256, training.name, training.weights_sha256)
+        WeightsDifferError.check(label, drives[-1].weights_sha256, training.name, training.weights_sha256)
     first, *seasons = drives
     route = first.route(other.closed)
-    seen = [SeenTwice(first, season, same_places(season.route(), route)) for season in seasons]
-    if not any(covers(route.position_m, twice.places[:, 0]) for twice in seen):
+    seasons_seen = [SeenTwice(first, season, same_places(season.route(), route)) for season in seasons]
+    if not any(covers(route.position_m, twice.places[:, 0]) for twice in seasons_seen):
         raise InvalidMapConfigError(
             f"{its_map} knows too few places in two seasons: {LEAST_SHARED_PLACES} over half of the route are the least"
         )
-    return tuple(seen)
+    return tuple(seasons_seen)

@@ -32,7 +32,7 @@ from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, counts_of
 from deepsimbad_client.recordings.annotations import as_taken
 
-Kept: TypeAlias = MutableMapping[str, tuple[NDArray[np.float32], bool]]
+EncodingCache: TypeAlias = MutableMapping[str, tuple[NDArray[np.float32], bool]]
 """Encodings [d], and whether the image shows nothing, by `Recording.stamp`."""
 
 _FRAMES_A_BLOCK = 1024
@@ -45,7 +45,7 @@ class EncodedRecording:
     """One recorded drive, encoded."""
 
     drive: Drive  # its frames, those that could be used
-    left_out_names: dict[str, list[str]] = field(default_factory=dict)  # reason -> frames that could not
+    left_out_names: dict[str, list[str]] = field(default_factory=dict)  # reason -> frames that could not be used
     encode_ms: float | None = None  # median from reading an image to its encoding; None where encodings came ready
 
     @property
@@ -58,11 +58,11 @@ class EncodedRecording:
 class EncodedBlock:
     """Neighbouring frames of a recording that were encoded together."""
 
-    places: NDArray[np.int64]  # [n] in `Recording.frames`, of those that could be read
+    places: NDArray[np.int64]  # [n] of the frames that could be read, in `Recording.frames`
     encodings: NDArray[np.float32]  # [n, d]
     shows_nothing: NDArray[np.bool_]  # [n]
     broken: Mapping[int, str]  # place: why it could not be read
-    image_ms: float | None  # that an image took; None: none was encoded
+    image_ms: float | None  # mean time of one image; None: none was encoded
 
 
 def encode_recording(
@@ -72,7 +72,7 @@ def encode_recording(
     on_progress: Callable[[float], None],
     *,
     allow_missing: bool = True,
-    kept: Kept | None = None,
+    encoding_cache: EncodingCache | None = None,
     blocks: Iterable[EncodedBlock] | None = None,
 ) -> EncodedRecording:
     """Encode a recording's images as the service would, or take its ready encodings.
@@ -80,7 +80,7 @@ def encode_recording(
     The client's own readers prepare the images (decision 0003), so one that is uploaded has the same numbers.
 
     Args:
-        kept: Encodings by `Recording.stamp` of earlier calls, which are not made again; takes those that are.
+        encoding_cache: Encodings of earlier calls, which are not made again; takes the new ones.
         blocks: All frames as they were encoded elsewhere, in the recording's order; None: they are encoded here.
 
     Raises:
@@ -95,7 +95,7 @@ def encode_recording(
     shows_nothing = np.zeros(len(frames), np.bool_)
     if encodings is None:
         places, encodings, shows_nothing, encode_ms = _encode_images(
-            recording, evaluator, max_pixels, left_out, on_progress, kept, blocks
+            recording, evaluator, max_pixels, left_out, on_progress, encoding_cache, blocks
         )
         frames, weights_sha256 = [frames[place] for place in places], evaluator.weights_sha256
     if not frames:
@@ -125,27 +125,27 @@ def encode_block(
     places: range,
     evaluator: Evaluator,
     max_pixels: int,
-    kept: Kept | None = None,
+    encoding_cache: EncodingCache | None = None,
     on_read: Callable[[int], None] = lambda _: None,
 ) -> EncodedBlock:
-    """Encode frames in one batch. Which images share a batch follows from their places alone, whoever encodes them.
+    """Encode frames in one batch; which images share one follows from their places alone, whoever encodes them.
 
     Args:
-        kept: As in `encode_recording`.
-        on_read: Told the place of every frame that was looked at; what it raises ends the block.
+        encoding_cache: As in `encode_recording`.
+        on_read: Called with the place of every frame that was read or found broken; what it raises ends the block.
     """
-    kept, broken = {} if kept is None else kept, {}
+    encoding_cache, broken = {} if encoding_cache is None else encoding_cache, {}
     readable: list[int] = []
     encodings = np.empty((len(places), evaluator.encoding_dim or 0), np.float32)
     shows_nothing = np.zeros(len(places), np.bool_)
-    waiting: dict[int, Image | Scene] = {}  # by the row of its encoding
-    stamps: list[str] = []  # what these are kept by
-    began = time.perf_counter()
+    pictures: dict[int, Image | Scene] = {}  # by the row of its encoding
+    stamps: list[str] = []  # their keys in the cache
+    started_s = time.perf_counter()
     for place in places:
         frame = recording.frames[place]
         stamp, row = recording.stamp(frame), len(readable)
-        if stamp in kept:
-            encodings[row], shows_nothing[row] = kept[stamp]
+        if stamp in encoding_cache:
+            encodings[row], shows_nothing[row] = encoding_cache[stamp]
             readable.append(place)
         else:
             try:
@@ -154,20 +154,20 @@ def encode_block(
                 broken[place] = error.reason
             else:
                 try:
-                    waiting[row] = read_observation(body.body, body.content_type, evaluator, max_pixels)
-                    check_whole(evaluator, waiting[row])
+                    pictures[row] = read_observation(body.body, body.content_type, evaluator, max_pixels)
+                    check_whole(evaluator, pictures[row])
                 except InvalidSceneError as error:
                     raise InvalidSceneError(f"{frame.name}: {error.message}", **error.hints) from error
-                shows_nothing[row] = shows_none(waiting[row])
+                shows_nothing[row] = shows_none(pictures[row])
                 stamps.append(stamp)
                 readable.append(place)
         on_read(place)
-    if waiting:
-        encodings[list(waiting)] = evaluator.encode(list(waiting.values()))
-        kept.update(
-            {stamp: (encodings[row], bool(shows_nothing[row])) for stamp, row in zip(stamps, waiting, strict=True)}
+    if pictures:
+        encodings[list(pictures)] = evaluator.encode(list(pictures.values()))
+        encoding_cache.update(
+            {stamp: (encodings[row], bool(shows_nothing[row])) for stamp, row in zip(stamps, pictures, strict=True)}
         )
-    image_ms = 1000 * (time.perf_counter() - began) / len(waiting) if waiting else None
+    image_ms = 1000 * (time.perf_counter() - started_s) / len(pictures) if pictures else None
     n_read = len(readable)
     return EncodedBlock(np.array(readable, np.int64), encodings[:n_read], shows_nothing[:n_read], broken, image_ms)
 
@@ -184,12 +184,13 @@ def _encode_images(
     max_pixels: int,
     left_out: LeftOut,
     on_progress: Callable[[float], None],
-    kept: Kept | None,
+    encoding_cache: EncodingCache | None,
     blocks: Iterable[EncodedBlock] | None,
 ) -> tuple[list[int], NDArray[np.float32], NDArray[np.bool_], float | None]:
-    """Places of the frames that could be read, their encodings, which show nothing, the median of milliseconds.
+    """Encode images block by block; broken ones are added to `left_out`.
 
-    Broken ones are counted.
+    Returns:
+        Places of the n frames that could be read, [n, d] encodings, [n] which show nothing, median ms of an image.
     """
     if not evaluator.forms or evaluator.encoding_dim is None:
         raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
@@ -204,8 +205,8 @@ def _encode_images(
 
     if blocks is None:
         blocks = (
-            encode_block(recording, of_block, evaluator, max_pixels, kept, on_read)
-            for of_block in places_of_blocks(n_frames, evaluator)
+            encode_block(recording, block_places, evaluator, max_pixels, encoding_cache, on_read)
+            for block_places in places_of_blocks(n_frames, evaluator)
         )
     for block in blocks:
         for place, reason in block.broken.items():
@@ -218,24 +219,24 @@ def _encode_images(
     return places, encodings[:n_read], shows_nothing[:n_read], encode_ms
 
 
-def measured(
+def measure_drive(
     drive: Drive, model: LandmarkModel, evaluator: Evaluator, on_progress: Callable[[float], None] = lambda _: None
 ) -> Drive:
     """The drive with its frames' dissimilarities to the landmarks, measured block by block.
 
-    Where the map compares something else than encodings, that stands for them.
+    Where the map compares something else than encodings, the drive has that in their place.
     """
-    blocks, vectors, is_otherwise_told = [], [], False
+    blocks, vectors, is_replaced = [], [], False
     for start in range(0, drive.n_frames, _FRAMES_A_BLOCK):
         encodings = drive.encodings[start : start + _FRAMES_A_BLOCK]
-        dissimilarities, compared = dissimilarities_and_vectors(evaluator, encodings, model)
+        dissimilarities, block_vectors = dissimilarities_and_vectors(evaluator, encodings, model)
         blocks.append(dissimilarities)
-        vectors.append(compared)
-        is_otherwise_told = is_otherwise_told or compared is not encodings
+        vectors.append(block_vectors)
+        is_replaced = is_replaced or block_vectors is not encodings
         on_progress(min(1.0, (start + _FRAMES_A_BLOCK) / drive.n_frames))
     if not blocks:
         return replace(drive, dissimilarities=np.empty((0, 0), np.float32))
-    if is_otherwise_told:
+    if is_replaced:
         drive = drive.standing_for(np.concatenate(vectors))
     return replace(drive, dissimilarities=np.concatenate(blocks))
 
@@ -261,9 +262,9 @@ def build(
     """Choose landmarks, describe every training frame by them, and learn from a second season where there is one.
 
     Args:
-        landmarks: The drive they are chosen from, the model that they stay in, or None: the training drive's own.
+        landmarks: The drive they are chosen from, or the model whose landmarks stay; None: the training drive.
         n_landmarks: r, where they are chosen.
-        camera: What it saw twice on other routes (`composed`).
+        camera: Places of other routes that the camera saw in two seasons (`composed`).
         fitter: Fits the evaluator, where landmarks are chosen; None: one without images.
     """
     if second is not None and np.array_equal(second.encodings, training.encodings):
@@ -271,26 +272,28 @@ def build(
     if plan.relevance is Relevance.COMPOSED and evaluator.is_squared_l2:
         return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera, evaluator.halves)
     candidates = training if landmarks is None else landmarks
-    fitted: Fitted | None = None
+    fit: Fitted | None = None
     origins: dict[str, Any] = {}
     if not isinstance(candidates, Drive):
         model: LandmarkModel = candidates
     else:
         other = second if candidates is training else training
         fitter = fitter or Fitter(evaluator)
-        rows, fitted = fitter.fit(plan, candidates, n_landmarks, other, lambda share: on_progress(share / 2))
-        model, origins = fitted.model, candidates.landmark_origins(rows)
+        rows, fit = fitter.fit(plan, candidates, n_landmarks, other, lambda share: on_progress(share / 2))
+        model, origins = fit.model, candidates.landmark_origins(rows)
 
-    def further(share: float) -> None:
+    def on_build_progress(share: float) -> None:
         on_progress((1 + share) / 2)
 
     if plan.relevance is Relevance.COMPOSED:
-        built = _composed_in_space(plan, training, second, landmarks, model, n_landmarks, evaluator, further, camera)
+        map_build = _composed_in_space(
+            plan, training, second, landmarks, model, n_landmarks, evaluator, on_build_progress, camera
+        )
     else:
-        measure = partial(measured, evaluator=evaluator)
-        built = build_from_dissimilarities(plan, training, second, model, measure, further)
-        built = replace(built, map=replace(built.map, **origins))
-    return built if fitted is None else replace(built, fitting=fitted.metrics or None, warnings=fitted.warnings)
+        measure = partial(measure_drive, evaluator=evaluator)
+        map_build = build_from_dissimilarities(plan, training, second, model, measure, on_build_progress)
+        map_build = replace(map_build, map=replace(map_build.map, **origins))
+    return map_build if fit is None else replace(map_build, fitting=fit.metrics or None, warnings=fit.warnings)
 
 
 def _composed_in_space(
@@ -307,15 +310,15 @@ def _composed_in_space(
     """`compose_map` where dissimilarities to all fitted landmarks stand for encodings (II-A, decision 0029)."""
 
     @cache
-    def by_id(drive_id: int) -> Drive:  # two names of one drive stay one
-        return compared(drives[drive_id], model, evaluator)
+    def drive_by_id(drive_id: int) -> Drive:  # two names of one drive stay one
+        return drive_in_space(drives[drive_id], model, evaluator)
 
     def in_space(drive: Drive) -> Drive:
         drives[id(drive)] = drive
-        return by_id(id(drive))
+        return drive_by_id(id(drive))
 
     drives: dict[int, Drive] = {}
-    built = compose_map(
+    map_build = compose_map(
         plan,
         in_space(training),
         None if second is None else in_space(second),
@@ -324,13 +327,13 @@ def _composed_in_space(
         on_progress,
         [replace(twice, first=in_space(twice.first), second=in_space(twice.second)) for twice in camera],
     )
-    whole = {**model, **built.map.landmark_model}
-    of_map, of_rehearsal = (replace(map_, landmark_model=whole) for map_ in (built.map, built.rehearsal))
-    return replace(built, map=of_map, rehearsal=of_rehearsal)
+    full_model = {**model, **map_build.map.landmark_model}
+    full_map, rehearsal = (replace(map_, landmark_model=full_model) for map_ in (map_build.map, map_build.rehearsal))
+    return replace(map_build, map=full_map, rehearsal=rehearsal)
 
 
-def compared(drive: Drive, model: LandmarkModel, evaluator: Evaluator) -> Drive:
-    """The drive with what a composed map compares in place of its encodings."""
+def drive_in_space(drive: Drive, model: LandmarkModel, evaluator: Evaluator) -> Drive:
+    """The drive with what a composed map compares in place of encodings."""
     if evaluator.is_squared_l2:
         return drive
     starts = range(0, drive.n_frames, _FRAMES_A_BLOCK)
@@ -340,7 +343,7 @@ def compared(drive: Drive, model: LandmarkModel, evaluator: Evaluator) -> Drive:
 
 def train_nnql(
     map_: Map,
-    own: Drive,
+    map_drive: Drive,
     second: Drive | None,
     config: NnqlConfig,
     on_progress: Callable[[float], None],
@@ -361,27 +364,29 @@ def train_nnql(
     Returns:
         Q-values [n, a] float32; and the learning curve and what it was learnt on, JSON-ready.
     """
-    started = time.perf_counter()
+    started_s = time.perf_counter()
     n_episodes = min(config.n_episodes, EPISODES_A_MAP_IMAGE * map_.n_images)
     q_values = initial_q_values(map_.n_images, map_.actions_m.size, config)
     curves: list[LearningCurve] = []
     with ThreadPoolExecutor(n_threads) if n_threads > 1 else nullcontext() as pool:
         if second is not None:
-            used = replace(config, n_episodes=n_episodes)
+            fold_config = replace(config, n_episodes=n_episodes)
             places = same_places(second.route(map_.closed), map_.route)
             true_image = np.full(second.n_frames, -1, np.int64)
             true_image[places[:, 1]] = places[:, 0]
-            q_values, curve = train(world_of(map_, second, true_image, used), used, on_progress, pool)
+            q_values, curve = train(world_of(map_, second, true_image, fold_config), fold_config, on_progress, pool)
             curves.append(curve)
         elif n_episodes:
-            used = replace(config, n_episodes=max(1, n_episodes // 2))
-            for fold, (images, half, live) in enumerate(_halves(map_, own)):
-                world = world_of(half, live, np.asarray(half.route.nearest_image(live.position_m), np.int64), used)
+            fold_config = replace(config, n_episodes=max(1, n_episodes // 2))
+            for fold, (images, half, live) in enumerate(_halves(map_, map_drive)):
+                world = world_of(
+                    half, live, np.asarray(half.route.nearest_image(live.position_m), np.int64), fold_config
+                )
 
                 def report(share: float, fold: int = fold) -> None:
                     on_progress((fold + share) / 2)
 
-                q_values[images], curve = train(world, used, report, pool)
+                q_values[images], curve = train(world, fold_config, report, pool)
                 curves.append(curve)
     return q_values, {
         "live_images": HELD_OUT if second is None else SECOND_DRIVE,
@@ -390,7 +395,7 @@ def train_nnql(
         "n_dissimilarities": n_episodes * config.n_actions_per_episode * map_.n_landmarks,
         "curves": [curve.as_dict() for curve in curves],
         "hyperparameters": asdict(config),
-        "seconds": time.perf_counter() - started,
+        "seconds": time.perf_counter() - started_s,
     }
 
 
@@ -399,9 +404,9 @@ def world_of(map_: Map, live: Drive, true_image: NDArray[np.int64], config: Nnql
     return TrainingWorld.on(map_, views_of(live), live.route(map_.closed), true_image, config)
 
 
-def _halves(map_: Map, own: Drive) -> Iterator[tuple[NDArray[np.int64], Map, Drive]]:
-    """Every second image, the map of these, and the images between as live views; then the other way round."""
-    every = np.arange(map_.n_images)
-    for images, frames in ((every[::2], every[1::2]), (every[1::2], every[::2])):
+def _halves(map_: Map, map_drive: Drive) -> Iterator[tuple[NDArray[np.int64], Map, Drive]]:
+    """Every second image, the map of those images, and the images between as live views; then the other way round."""
+    all_images = np.arange(map_.n_images)
+    for images, frames in ((all_images[::2], all_images[1::2]), (all_images[1::2], all_images[::2])):
         if images.size and frames.size:
-            yield images, map_.at(images), own.at(frames)
+            yield images, map_.at(images), map_drive.at(frames)

@@ -1,7 +1,7 @@
 """The process of one job: `python -m deepsimbad.jobs.child PRIORITY`, started by `jobs.runner` (decision 0011).
 
-It says everything as JSON lines on its standard output, and takes from its standard input one line that says which job,
-then perhaps one more, which cancels. When its input ends, its parent is dead and it ends at once.
+It sends its messages as JSON lines on its standard output, and takes from its standard input one line that names the
+job, then perhaps one more, which cancels. When its input ends, its parent is dead and it ends at once.
 
 Nothing heavy is imported before the priority is low: threads inherit it from the one that starts them.
 """
@@ -25,7 +25,7 @@ _LOWEST_NICE = 19
 _PR_SET_PDEATHSIG = 1
 _KILL_ME_FIRST = 500  # of 1000: where memory runs out, the kernel shall end the job rather than the service
 _ORPHANED = 3  # exit code
-_writing = threading.Lock()
+_write_lock = threading.Lock()
 
 
 class JobPriority(StrEnum):
@@ -37,7 +37,7 @@ class JobPriority(StrEnum):
 
 
 def _take_priority(priority: JobPriority) -> None:
-    """Let this process, and the threads it starts from now on, run so; what a system does not have is left out.
+    """Give this process, and the threads it starts from now on, a priority, as far as the system has such.
 
     Idle takes the machine only while nobody else wants it: an idle-class thread is preempted at once, and the kernel
     (since 5.4) counts its core as free when it places a waking thread. Low still keeps about a seventieth of a
@@ -54,7 +54,7 @@ def _take_priority(priority: JobPriority) -> None:
 
 def _tell(**message: Any) -> None:
     """Send one message, on a line of its own whatever a library has printed."""
-    with _writing, suppress(BrokenPipeError):  # the parent is gone, and this process soon as well
+    with _write_lock, suppress(BrokenPipeError):  # the parent is gone, and this process soon as well
         os.write(1, b"\n" + json.dumps(message, default=str).encode() + b"\n")
 
 
@@ -71,10 +71,10 @@ class _LogToParent(logging.Handler):
         _tell(log={"name": record.name, "levelno": record.levelno, "msg": record.getMessage(), "extra": extra})
 
 
-def _listen(commands: Any, cancelled: threading.Event) -> None:
-    """Wait for the one thing that may follow the order, or for the end."""
+def _listen(commands: Any, cancellation: threading.Event) -> None:
+    """Set `cancellation` when a line comes; end the process when the input ends."""
     while commands.readline():
-        cancelled.set()
+        cancellation.set()
     os._exit(_ORPHANED)
 
 
@@ -89,15 +89,15 @@ def main() -> None:
     line = sys.stdin.buffer.readline()
     if not line.endswith(b"\n"):
         os._exit(_ORPHANED)
-    order, cancelled = json.loads(line), threading.Event()
+    request, cancellation = json.loads(line), threading.Event()
     if sys.platform == "linux":  # the kernel ends this process with its parent at once, the listener a little later
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != order["parent_pid"]:  # it died before that
+    if os.getppid() != request["parent_pid"]:  # it died before that
         os._exit(_ORPHANED)
-    threading.Thread(target=_listen, args=(sys.stdin.buffer, cancelled), name="parent", daemon=True).start()
+    threading.Thread(target=_listen, args=(sys.stdin.buffer, cancellation), name="parent", daemon=True).start()
     logging.getLogger().addHandler(_LogToParent())
-    logging.getLogger("deepsimbad").setLevel(order["log_level"])
+    logging.getLogger("deepsimbad").setLevel(request["log_level"])
     logging.captureWarnings(True)
 
     gc.disable()  # imports leave little behind, and looking for it would be an eighth of them
@@ -110,11 +110,11 @@ def main() -> None:
 
     gc.freeze()
     gc.enable()
-    job = TypeAdapter(JobRecord).validate_python(order["job"])
-    compute = TypeAdapter(Compute).validate_python(order["compute"])
-    run_job = InThisProcess(Path(order["data_dir"]), order["n_threads"], compute)
+    job = TypeAdapter(JobRecord).validate_python(request["job"])
+    compute = TypeAdapter(Compute).validate_python(request["compute"])
+    run_job = InThisProcess(Path(request["data_dir"]), request["n_threads"], compute)
     try:
-        result = run_job(job, lambda state: _tell(progress=vars(state)), cancelled.is_set)
+        result = run_job(job, lambda state: _tell(progress=vars(state)), cancellation.is_set)
     except DeepSimbadError as error:
         _tell(error={"code": error.code, "message": error.message, "hints": error.hints})
     except Exception:

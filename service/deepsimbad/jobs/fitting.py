@@ -26,8 +26,8 @@ _ANY_SIZE = 1 << 31  # pixels
 _VIEWS_SHARE, _FIT_SHARE = 0.1, 0.6  # of progress: landmarks chosen, their views encoded
 
 
-def learns(evaluator: Evaluator, relevance: Relevance) -> Fitting:
-    """What an evaluator is fitted to for maps of a relevance; `composed` compares encodings that are L2 themselves."""
+def fitting_of(evaluator: Evaluator, relevance: Relevance) -> Fitting:
+    """What an evaluator is fitted to for maps of a relevance: nothing where `composed` compares encodings by L2."""
     return Fitting.NOTHING if relevance is Relevance.COMPOSED and evaluator.is_squared_l2 else evaluator.fitting
 
 
@@ -38,14 +38,14 @@ class Pictures(Protocol):
         """The frame's image; None: it is not there."""
 
     def views(self, index: int) -> NDArray[np.float32] | None:
-        """[a, d] that were kept; None: none were."""
+        """The encodings [a, d] of views that were kept; None: none were."""
 
     def keep_views(self, views: dict[int, NDArray[np.float32]]) -> None:
         """Keep encodings of views by frames' indices, for the next fit or for this one begun again."""
 
 
 class RecordingPictures:
-    """Those of a recording at hand; views are kept in memory."""
+    """The images of a recording at hand; views are kept in memory."""
 
     def __init__(self, recording: Recording, max_pixels: int) -> None:
         self._recording, self._max_pixels = recording, max_pixels
@@ -68,17 +68,17 @@ class RecordingPictures:
 
 
 class SpooledPictures:
-    """Those that wait with a traverse, where views of them are kept too; `elsewhere` has those that do not wait."""
+    """Those that wait with a traverse, where views of them are kept too; `fallback` has those that do not wait."""
 
-    def __init__(self, traverse: Traverse, drive: Drive, elsewhere: Pictures | None = None) -> None:
+    def __init__(self, traverse: Traverse, drive: Drive, fallback: Pictures | None = None) -> None:
         self._traverse, self._levels, self._dim = traverse, drive.grey_levels, drive.encoding_dim
-        self._elsewhere = elsewhere
+        self._fallback = fallback
 
     def image(self, index: int) -> Image | None:
         """See `Pictures`."""
         if (body := self._traverse.picture(index)) is not None:
-            return decode_image(body, _ANY_SIZE, levels=self._levels)  # one that was taken when it was sent
-        return None if self._elsewhere is None else self._elsewhere.image(index)
+            return decode_image(body, _ANY_SIZE, levels=self._levels)  # its size was checked when it was sent
+        return None if self._fallback is None else self._fallback.image(index)
 
     def views(self, index: int) -> NDArray[np.float32] | None:
         """See `Pictures`."""
@@ -93,8 +93,8 @@ class Fitter:
     """Fits one evaluator; the same landmarks of the same drives are learnt once.
 
     Args:
-        pictures: Of the drive that landmarks are chosen from; None: there are no images.
-        seed: Of everything random.
+        pictures: The images of the drive that landmarks are chosen from; None: there are none.
+        seed: Seeds everything random.
     """
 
     def __init__(self, evaluator: Evaluator, pictures: Pictures | None = None, seed: int = 0) -> None:
@@ -106,34 +106,39 @@ class Fitter:
         plan: MapPlan,
         candidates: Drive,
         n_landmarks: int,
-        other: Drive | None,
+        other_drive: Drive | None,
         on_progress: Callable[[float], None],
     ) -> tuple[NDArray[np.int64], Fitted]:
         """Choose r of the candidates, and fit the evaluator to them; see `select_landmarks` and `Evaluator.fit`.
 
-        The other drive is perhaps of the same route.
+        Args:
+            other_drive: A drive that may be of the same route.
+
+        Returns:
+            [r] frames of the candidates, and the fit.
         """
-        fitting, asked = self._evaluator.fitting, (candidates, n_landmarks, other)
+        fitting, key = self._evaluator.fitting, (candidates, n_landmarks, other_drive)
         if self._last is not None and all(
-            one is two or (one == two and isinstance(one, int)) for one, two in zip(asked, self._last[0], strict=True)
+            new_part is last_part or (new_part == last_part and isinstance(new_part, int))
+            for new_part, last_part in zip(key, self._last[0], strict=True)
         ):
             return self._last[1]
-        to_choose = 1.0 if fitting is Fitting.NOTHING else _VIEWS_SHARE
-        rows = select_landmarks(candidates.encodings, n_landmarks, lambda share: on_progress(share * to_choose))
+        selection_share = 1.0 if fitting is Fitting.NOTHING else _VIEWS_SHARE
+        rows = select_landmarks(candidates.encodings, n_landmarks, lambda share: on_progress(share * selection_share))
         if fitting is Fitting.NOTHING:
             return rows, self._evaluator.fit(Lesson(candidates.encodings, rows))
         views: NDArray[np.float32] | None = None
         warnings: tuple[str, ...] = ()
         if fitting is Fitting.IMAGES:
-            between = _FIT_SHARE - _VIEWS_SHARE
-            views, warnings = self._views(candidates, rows, lambda s: on_progress(_VIEWS_SHARE + s * between))
-        places = None if other is None else _same_places(plan, candidates, other, rows)
+            views_share = _FIT_SHARE - _VIEWS_SHARE
+            views, warnings = self._views(candidates, rows, lambda s: on_progress(_VIEWS_SHARE + s * views_share))
+        places = None if other_drive is None else _same_places(plan, candidates, other_drive, rows)
         fitted = self._evaluator.fit(
             Lesson(
                 candidates.encodings,
                 rows,
                 candidates.position_m,
-                None if places is None or other is None else other.encodings,
+                None if places is None or other_drive is None else other_drive.encodings,
                 np.empty((0, 2), np.int64) if places is None else places,
                 views,
                 self._seed,
@@ -141,59 +146,66 @@ class Fitter:
             )
         )
         n_views = 0 if views is None else views.shape[0] * views.shape[1]
-        known = {"n_views": n_views, "n_shared_places": 0 if places is None else len(places)}
-        fitted = Fitted(fitted.model, {**known, **fitted.metrics}, (*warnings, *fitted.warnings))
-        self._last = asked, (rows, fitted)
+        counts = {"n_views": n_views, "n_shared_places": 0 if places is None else len(places)}
+        fitted = Fitted(fitted.model, {**counts, **fitted.metrics}, (*warnings, *fitted.warnings))
+        self._last = key, (rows, fitted)
         return rows, fitted
 
     def _views(
         self, candidates: Drive, rows: NDArray[np.int64], on_progress: Callable[[float], None]
     ) -> tuple[NDArray[np.float32] | None, tuple[str, ...]]:
-        """[r, a, d] encodings of augmented views, kept as they are made; where images are gone the landmark itself.
+        """Encode augmented views of every landmark, keeping them as they are made.
 
-        None where no landmark has any; and what to say of those that have none.
+        Returns:
+            [r, a, d], a landmark whose image is gone repeated in place of its views, None where all images are; and
+            warnings of those that are.
         """
-        pictures, index = self._pictures, candidates.index[rows].tolist()
-        known = {at: None if pictures is None else pictures.views(at) for at in index}
-        to_do = [at for at in index if known[at] is None]
-        for first in range(0, len(to_do), _LANDMARKS_AT_ONCE):
+        pictures, indices = self._pictures, candidates.index[rows].tolist()
+        views_of = {index: None if pictures is None else pictures.views(index) for index in indices}
+        missing_indices = [index for index in indices if views_of[index] is None]
+        for first in range(0, len(missing_indices), _LANDMARKS_AT_ONCE):
             if pictures is None:
                 break
-            on_progress(first / len(to_do))
-            images = {at: pictures.image(at) for at in to_do[first : first + _LANDMARKS_AT_ONCE]}
-            new = {at: self._encoded(augmented(image, at)) for at, image in images.items() if image is not None}
-            pictures.keep_views(new)
-            known |= new
-        without = [row for row, at in zip(rows.tolist(), index, strict=True) if known[at] is None]
+            on_progress(first / len(missing_indices))
+            images = {index: pictures.image(index) for index in missing_indices[first : first + _LANDMARKS_AT_ONCE]}
+            new_views = {
+                index: self._encoded(augmented(image, index)) for index, image in images.items() if image is not None
+            }
+            pictures.keep_views(new_views)
+            views_of |= new_views
+        bare_rows = [row for row, index in zip(rows.tolist(), indices, strict=True) if views_of[index] is None]
         warnings: tuple[str, ...] = ()
-        if without:
+        if bare_rows:
             warnings = (
-                f"fitted_without_images: {len(without)} of {len(rows)} landmarks have no image waiting any more (or "
+                f"fitted_without_images: {len(bare_rows)} of {len(rows)} landmarks have no image waiting any more (or "
                 "came as encodings), and were fitted to the drive's encodings alone: upload the landmark drive anew "
                 "to fit to its images",
             )
-        if len(without) == len(rows):
+        if len(bare_rows) == len(rows):
             return None, warnings
-        own = {at: np.repeat(candidates.encodings[row][np.newaxis], VIEWS_A_LANDMARK, axis=0)
-               for row, at in zip(rows.tolist(), index, strict=True) if known[at] is None}  # fmt: skip
-        return np.stack([own[at] if views is None else views for at, views in known.items()]), warnings
+        repeated = {index: np.repeat(candidates.encodings[row][np.newaxis], VIEWS_A_LANDMARK, axis=0)
+                    for row, index in zip(rows.tolist(), indices, strict=True) if views_of[index] is None}  # fmt: skip
+        return np.stack([repeated[index] if views is None else views for index, views in views_of.items()]), warnings
 
     def _encoded(self, images: list[Image]) -> NDArray[np.float32]:
-        """[a, d]."""
+        """Encode images as [a, d]."""
         at_once = max(1, self._evaluator.largest_batch)
-        small = [self._evaluator.prepare(image) for image in images]
+        small_images = [self._evaluator.prepare(image) for image in images]
         return np.concatenate(
-            [self._evaluator.encode(small[first : first + at_once]) for first in range(0, len(small), at_once)]
+            [
+                self._evaluator.encode(small_images[first : first + at_once])
+                for first in range(0, len(small_images), at_once)
+            ]
         )
 
 
 def _same_places(plan: MapPlan, candidates: Drive, other: Drive, rows: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """[k, 2] (candidate, frame of the other drive) that saw one place; None where views say that the routes are two."""
+    """[k, 2] pairs (candidate, frame of the other drive) of one place; None where views say that the routes are two."""
     landmarks = np.ascontiguousarray(candidates.encodings[rows])
 
-    def by_l2(drive: Drive) -> Drive:
+    def with_l2(drive: Drive) -> Drive:
         encodings = np.ascontiguousarray(drive.encodings)
         return replace(drive, encodings=encodings, dissimilarities=squared_distances(encodings, landmarks))
 
-    season, _, _ = second_season(by_l2(candidates), plan.closed, other, plan.same_route, by_l2)
+    season, _, _ = second_season(with_l2(candidates), plan.closed, other, plan.same_route, with_l2)
     return None if season is None else season.places

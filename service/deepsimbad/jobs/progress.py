@@ -1,4 +1,4 @@
-"""How long work tells what it is doing and learns that it should stop."""
+"""How work reports its progress and learns that it should stop."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -74,19 +74,19 @@ class Progress:
         *_, (stage, began_s) = self._began_s.items()
         names = list(self._weights)
         total = sum(self._weights.values())
-        before = sum(self._weights[name] for name in names[: names.index(stage)]) / total
+        finished_share = sum(self._weights[name] for name in names[: names.index(stage)]) / total
         weight = self._weights[stage] / total
-        done = before + share * weight
+        total_share = finished_share + share * weight
         eta_s = None
-        if done > 0.01:
-            pace_s = (now_s - self._started_s) / done
+        if total_share > 0.01:
+            pace_s = (now_s - self._started_s) / total_share
             # A stage may take a multiple of its expected share: its weight does not know how many episodes it has.
-            own_s = (now_s - began_s) * (1 - share) / share if share > 0.01 else pace_s * weight * (1 - share)
-            eta_s = own_s + pace_s * max(0.0, 1 - done - weight * (1 - share))
-        self._on_change(ProgressState(stage, done, eta_s))
+            stage_left_s = (now_s - began_s) * (1 - share) / share if share > 0.01 else pace_s * weight * (1 - share)
+            eta_s = stage_left_s + pace_s * max(0.0, 1 - total_share - weight * (1 - share))
+        self._on_change(ProgressState(stage, total_share, eta_s))
 
     def seconds(self) -> dict[str, float]:
-        """What every stage so far took, as a result tells it; the one under way until now."""
+        """The seconds that every stage took so far, by its name with underscores."""
         ends_s = [*list(self._began_s.values())[1:], self._clock()]
         stages = zip(self._began_s.items(), ends_s, strict=True)
         return {name.replace(" ", "_"): end_s - began_s for (name, began_s), end_s in stages}
@@ -94,31 +94,31 @@ class Progress:
 
 @dataclass
 class Shares:
-    """Pieces of work that several threads do, of known weight, told as one share."""
+    """Pieces of work of known weight that several threads do, reported as one share."""
 
-    tell: Callable[[str, float], None]  # of the piece under way and the share that is done; may raise CancelledError
+    tell: Callable[[str, float], None]  # takes the piece under way and the share done; may raise CancelledError
     weights: Mapping[str, float]
-    _done: dict[str, float] = field(default_factory=dict)
+    _shares: dict[str, float] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     def report(self, name: str) -> Callable[[float], None]:
-        """Takes the share of one piece."""
+        """A function that takes the share done of one piece."""
 
         def update(share: float) -> None:
             with self._lock:
-                self._done[name] = share
-                done = sum(self.weights[piece] * each for piece, each in self._done.items())
-            self.tell(name, done / max(sum(self.weights.values()), 1e-9))
+                self._shares[name] = share
+                weighted_share = sum(self.weights[piece] * piece_share for piece, piece_share in self._shares.items())
+            self.tell(name, weighted_share / max(sum(self.weights.values()), 1e-9))
 
         return update
 
 
 def in_threads(pieces: Sequence[Callable[[], None]]) -> None:
-    """Do all, as many at once as there are cores; the first error ends them, and is raised."""
+    """Do all pieces, as many at once as there are cores; the first error ends them, and is raised."""
     with ThreadPoolExecutor(available_cores()) as pool:
         futures = [pool.submit(piece) for piece in pieces]
-        done, waiting = wait(futures, return_when=FIRST_EXCEPTION)
+        finished, waiting = wait(futures, return_when=FIRST_EXCEPTION)
         for future in waiting:
             future.cancel()
-        for future in done:
+        for future in finished:
             future.result()

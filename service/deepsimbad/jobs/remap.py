@@ -34,14 +34,14 @@ from deepsimbad.jobs.append import (
     TRAINING,
     KnownDrives,
     append_drive,
+    camera_seasons,
     fuse,
     known_drives,
     refuse_known_traverse,
-    seen_twice,
 )
-from deepsimbad.jobs.build import build, compared, measured, train_nnql
+from deepsimbad.jobs.build import build, drive_in_space, measure_drive, train_nnql
 from deepsimbad.jobs.check import CheckFrames, check_map
-from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures, learns
+from deepsimbad.jobs.fitting import Fitter, Pictures, SpooledPictures, fitting_of
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import (
     DEFAULT_N_LANDMARKS,
@@ -50,7 +50,7 @@ from deepsimbad.jobs.remap_config import (
     RemapConfig,
     check_alike,
     check_filled,
-    staying,
+    staying_map,
 )
 from deepsimbad.jobs.versions import activate_once, seal_version
 from deepsimbad.store.catalog import Catalog
@@ -80,7 +80,7 @@ def remap(
     Args:
         progress: Reports the stages of REMAP_STAGES; may cancel.
         job_id: The job that this is: one that was interrupted after it sealed its version makes no other. None: none.
-        pictures: Of the drive that landmarks are chosen from, beside those that wait in its traverse.
+        pictures: Images of the drive that landmarks are chosen from, beside those that wait in its traverse.
 
     Returns:
         `{"map_version", "active", "metrics"}`, as the job's result.
@@ -88,23 +88,23 @@ def remap(
     Raises:
         DeepSimbadError: Whatever is wrong with the traverses, the parameters or the storage, by name.
     """
-    sealed = None if job_id is None else catalog.map_of_job(domain, job_id)
-    if sealed is None:
-        sealed = _Remap(catalog, domain, config, evaluator, progress, n_threads, pictures).sealed(job_id)
+    record = None if job_id is None else catalog.map_of_job(domain, job_id)
+    if record is None:
+        record = _Remap(catalog, domain, config, evaluator, progress, n_threads, pictures).seal(job_id)
     progress.stage("activate")
     for name in {config.training_traverse, config.landmark_traverse, config.check_traverse} - {None}:
         with suppress(UnknownTraverseError), Traverse.open(catalog.data_dir, domain, str(name)) as traverse:
             traverse.empty_spool()
-    check = sealed.metrics["check"]
-    active = config.activate and check["passed"] is not False
-    if active:
+    check = record.metrics["check"]
+    is_active = config.activate and check["passed"] is not False
+    if is_active:
         try:
-            activate_once(catalog, domain, sealed, ANY if config.gate_margin is None else check["active_version"])
+            activate_once(catalog, domain, record, ANY if config.gate_margin is None else check["active_version"])
         except LostActivationError as error:
-            active = False
-            why = f"{error.message}; the new map was compared with another one, and stays sealed"
-            check = {**check, "why": why}
-    return {"map_version": sealed.version, "active": active, "metrics": {**sealed.metrics, "check": check}}
+            is_active = False
+            reason = f"{error.message}; the new map was compared with another one, and stays sealed"
+            check = {**check, "why": reason}
+    return {"map_version": record.version, "active": is_active, "metrics": {**record.metrics, "check": check}}
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,8 @@ class _Inputs:
     # None where there is none of the same encoder, or where frames are appended
     second: Drive | None
     camera: tuple[SeenTwice, ...]  # what the camera saw twice on another route
-    known: KnownDrives | str | None  # what `base` is made of, or why nothing can be fused; None: nothing is appended
+    # What `base` is made of, or why nothing can be fused; None: nothing is appended
+    map_drives: KnownDrives | str | None
     check: Drive | None  # the drive that the new map is checked on; None: on frames of `training` that are held out
 
 
@@ -141,8 +142,8 @@ class _Remap:
     n_threads: int
     pictures: Pictures | None
 
-    def sealed(self, job_id: str | None) -> MapRecord:
-        """The next version, sealed; what is decided of it later must stand in its metrics."""
+    def seal(self, job_id: str | None) -> MapRecord:
+        """Build, check and seal the next version; what activates it later is read from its metrics."""
         config, progress = self.config, self.progress
         progress.stage("read frames")
         inputs = self._read()
@@ -153,14 +154,14 @@ class _Remap:
             held_out=inputs.check is None,
         )
         if inputs.base is not None and config.append:
-            map_, checked, record_config, learnt = self._appended(inputs, inputs.base, frames)
+            map_, checked_map, record_config, results = self._append_traverse(inputs, inputs.base, frames)
         else:
-            map_, checked, record_config, learnt = self._mapped(inputs)
+            map_, checked_map, record_config, results = self._map_traverse(inputs)
         progress.stage("check")
         check = check_map(
             self.catalog,
             self.domain,
-            checked,
+            checked_map,
             record_config,
             frames,
             config.gate_margin,
@@ -168,40 +169,44 @@ class _Remap:
             progress.update,
         )
         seconds = {
-            name: took for name, took in progress.seconds().items() if name.replace("_", " ") in {*REMAP_STAGES, FIT}
+            name: stage_s
+            for name, stage_s in progress.seconds().items()
+            if name.replace("_", " ") in {*REMAP_STAGES, FIT}
         }
         metrics = {
             "n_map_images": map_.n_images,
             "n_uninformative": int((inputs.training.shows_nothing | inputs.training.is_unlike_all).sum()),
             "n_landmarks": map_.n_landmarks,
             "seconds": seconds,
-            **learnt,
+            **results,
             "check": check,
-            "warnings": [*learnt["warnings"], *self._warnings(inputs)],
+            "warnings": [*results["warnings"], *self._warnings(inputs)],
         }
         progress.stage("seal")
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
 
     def _warnings(self, inputs: _Inputs) -> list[str]:
-        """What a person should know of the drives, in sentences: pictures not alike, or of nothing."""
-        own, theirs = inputs.training.camera, f"those of traverse {self.config.training_traverse}"
+        """Warnings of the drives' pictures: of drives that are not alike, or that show nothing."""
+        training_camera, training_label = inputs.training.camera, f"those of traverse {self.config.training_traverse}"
         pairs: list[tuple[Drive | None, tuple[Camera | None, ...], str]]
-        pairs = [(drive, (own,), theirs) for drive in (inputs.candidates, inputs.second, inputs.check)]
+        pairs = [
+            (drive, (training_camera,), training_label) for drive in (inputs.candidates, inputs.second, inputs.check)
+        ]
         if inputs.base is not None:
             pairs.append((inputs.training, inputs.base.cameras, "those of the active map"))
         warnings: dict[str, None] = {}  # in order, each once
-        for drive, cameras, whose in pairs:
+        for drive, cameras, label in pairs:
             if drive is not None and drive.camera is not None:
-                why = drive.camera.unlike(filter(None, cameras), whose)
-                if why is not None:
-                    warnings[f"the pictures of traverse {drive.name} are not like {whose}: {why}"] = None
+                reason = drive.camera.unlike(filter(None, cameras), label)
+                if reason is not None:
+                    warnings[f"the pictures of traverse {drive.name} are not like {label}: {reason}"] = None
         return [*warnings, *inputs.training.picture_warnings("of the map")]
 
     def _read(self) -> _Inputs:
         """Read what is needed, every traverse once.
 
         Raises:
-            UnknownDomainError, UnknownTraverseError: There is none such.
+            UnknownDomainError, UnknownTraverseError: There is no such domain or traverse.
             InvalidMapConfigError: A traverse is empty, or no landmarks could stay.
             InvalidRouteError: The training or the check traverse goes backwards.
             InvalidEncodingError: The traverses come from two encoders.
@@ -210,16 +215,16 @@ class _Remap:
         config, record = self.config, self.catalog.domain(self.domain)
         read = cache(self._drive)
         training = read(config.training_traverse)
-        training.route(record.closed)  # what is wrong with it is said now, not after the map is built
+        training.route(record.closed)  # raises here rather than after the map is built
         candidates = base = check = None
         camera: tuple[SeenTwice, ...] = ()
         if config.camera_of is not None:
-            camera = seen_twice(self.catalog, config.camera_of, record, training)
+            camera = camera_seasons(self.catalog, config.camera_of, record, training)
         if config.landmark_traverse is None:
             base = None if camera else self._base(record)
             if base is not None:
-                joining = f"traverse {config.training_traverse}"
-                WeightsDifferError.check("the active map", base.weights_sha256, joining, training.weights_sha256)
+                label = f"traverse {config.training_traverse}"
+                WeightsDifferError.check("the active map", base.weights_sha256, label, training.weights_sha256)
         else:
             candidates = read(config.landmark_traverse)
             self._check_encoder(config.landmark_traverse, candidates, training)
@@ -228,8 +233,10 @@ class _Remap:
             self._check_encoder(config.check_traverse, check, training)
             check.route(record.closed)
         second = None if config.append else self._second_season(record, training, read)
-        known = known_drives(self.catalog, record, base, training, read) if config.append and base is not None else None
-        return _Inputs(record, training, candidates, base, second, camera, known, check)
+        drives = (
+            known_drives(self.catalog, record, base, training, read) if config.append and base is not None else None
+        )
+        return _Inputs(record, training, candidates, base, second, camera, drives, check)
 
     def _drive(self, name: str) -> Drive:
         with Traverse.open(self.catalog.data_dir, self.domain, name) as traverse:
@@ -252,11 +259,11 @@ class _Remap:
     def _second_season(self, record: DomainRecord, training: Drive, read: Callable[[str], Drive]) -> Drive | None:
         names = [self.config.landmark_traverse]
         if names[0] is None and record.active_version is not None:
-            before = self.catalog.map(record.name, record.active_version).config
-            names = [before["training_traverse"], before["landmark_traverse"]]
-        stored = Traverse.list(self.catalog.data_dir, record.name)
+            config = self.catalog.map(record.name, record.active_version).config
+            names = [config["training_traverse"], config["landmark_traverse"]]
+        stored_names = Traverse.list(self.catalog.data_dir, record.name)
         for name in names:
-            if name is not None and name != self.config.training_traverse and name in stored:
+            if name is not None and name != self.config.training_traverse and name in stored_names:
                 second = read(name)
                 weights = {second.weights_sha256, training.weights_sha256} - {None}
                 if second.encoding_dim == training.encoding_dim and len(weights) <= 1:
@@ -268,10 +275,10 @@ class _Remap:
             if self.config.append:
                 raise InvalidMapConfigError(f"domain {record.name} has no active map that could be appended to")
             return None
-        return staying(self.config, read_map(self.catalog.map_file(record.name, record.active_version)))
+        return staying_map(self.config, read_map(self.catalog.map_file(record.name, record.active_version)))
 
-    def _mapped(self, inputs: _Inputs) -> _Draft:
-        """The training traverse as a map of its own."""
+    def _map_traverse(self, inputs: _Inputs) -> _Draft:
+        """Map the training traverse by itself."""
         config, domain, training = self.config, inputs.domain, inputs.training
         landmarks = inputs.candidates if inputs.base is None else inputs.base.landmark_model
         n_candidates = (inputs.candidates or training).n_frames
@@ -284,12 +291,12 @@ class _Remap:
         candidates = inputs.candidates or training
         with Traverse.open(self.catalog.data_dir, self.domain, candidates.name or "") as traverse:
             fitter = Fitter(self.evaluator, SpooledPictures(traverse, candidates, self.pictures), config.seed)
-            if inputs.base is None and learns(self.evaluator, config.relevance) is not Fitting.NOTHING:
+            if inputs.base is None and fitting_of(self.evaluator, config.relevance) is not Fitting.NOTHING:
                 self.progress.stage(FIT)
                 other = inputs.second if candidates is training else training
                 fitter.fit(plan, candidates, n_landmarks, other, self.progress.update)
             self.progress.stage("describe")
-            built = build(
+            map_build = build(
                 plan,
                 training,
                 inputs.second,
@@ -305,51 +312,54 @@ class _Remap:
         if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
             self.progress.stage("train")
             q_values, learning = train_nnql(
-                built.rehearsal,
-                built.map_drive,
-                built.second,
+                map_build.rehearsal,
+                map_build.map_drive,
+                map_build.second,
                 NnqlConfig(n_episodes=config.training_episodes, seed=config.seed),
                 self.progress.update,
                 self.n_threads,
             )
-        asked = config.as_dict()
-        landmarks_from = inputs.base or inputs.candidates
-        weights_sha256 = training.weights_sha256 or (landmarks_from and landmarks_from.weights_sha256)
+        config_document = config.as_dict()
+        landmark_source = inputs.base or inputs.candidates
+        weights_sha256 = training.weights_sha256 or (landmark_source and landmark_source.weights_sha256)
         if weights_sha256 is not None:
-            asked["weights_sha256"] = weights_sha256
+            config_document["weights_sha256"] = weights_sha256
         if training.camera is not None:
-            asked["cameras"] = [training.camera.as_dict()]
+            config_document["cameras"] = [training.camera.as_dict()]
         map_ = replace(
-            built.map,
+            map_build.map,
             domain=domain.name,
             evaluator=domain.evaluator,
-            config={**asked, **built.map.config},
-            landmark_model=with_levels(built.map.landmark_model, training.grey_levels),
+            config={**config_document, **map_build.map.config},
+            landmark_model=with_levels(map_build.map.landmark_model, training.grey_levels),
             **training.origins(),
             **({} if inputs.base is None else inputs.base.landmark_origins()),
             q_values=q_values,
         )
         second_season = None
-        if built.same_route is not None and inputs.second is not None:
-            second_season = {**built.same_route.as_dict(), "traverse": inputs.second.name}
+        if map_build.same_route is not None and inputs.second is not None:
+            second_season = {**map_build.same_route.as_dict(), "traverse": inputs.second.name}
         source = TRAINING if landmarks is None else LANDMARK_TRAVERSE if inputs.base is None else ACTIVE_MAP
-        learnt: dict[str, Any] = {"landmarks": source, "training": learning, "second_season": second_season}
-        learnt["camera_of"] = config.camera_of if built.by_camera else None
-        if built.fitting is not None:
-            learnt["fitting"] = dict(built.fitting)
-        learnt["warnings"] = [*built.warnings, *(() if built.same_route is None else built.same_route.remarks())]
-        return map_, map_, asked, learnt
+        results: dict[str, Any] = {"landmarks": source, "training": learning, "second_season": second_season}
+        results["camera_of"] = config.camera_of if map_build.by_camera else None
+        if map_build.fitting is not None:
+            results["fitting"] = dict(map_build.fitting)
+        results["warnings"] = [
+            *map_build.warnings,
+            *(() if map_build.same_route is None else map_build.same_route.remarks()),
+        ]
+        return map_, map_, config_document, results
 
-    def _appended(self, inputs: _Inputs, before: Map, frames: CheckFrames) -> _Draft:
-        """A copy of the active map with the training traverse fused into its images, or among them."""
+    def _append_traverse(self, inputs: _Inputs, old_map: Map, frames: CheckFrames) -> _Draft:
+        """Fuse the training traverse into the images of a copy of the active map, or add its frames to them."""
         config, drive = self.config, inputs.training
         record = self.catalog.map(self.domain, inputs.domain.active_version or 0)
         self.progress.stage("describe")
         refuse_known_traverse(record, config.training_traverse)
-        held = [] if before.frame_digest is None else [before.frame_digest]
-        if isinstance(inputs.known, KnownDrives):
-            held += [season.digests() for season in inputs.known.seasons]
-        if held and np.isin(drive.digests(), np.concatenate(held)).all():
+        digests = [] if old_map.frame_digest is None else [old_map.frame_digest]
+        if isinstance(inputs.map_drives, KnownDrives):
+            digests += [season.digests() for season in inputs.map_drives.seasons]
+        if digests and np.isin(drive.digests(), np.concatenate(digests)).all():
             raise InvalidMapConfigError(
                 f"map {record.version}, which serves, holds every frame of traverse {config.training_traverse} "
                 "already, under another name: nothing is appended twice. Append another drive, or activate a map "
@@ -357,43 +367,47 @@ class _Remap:
                 traverse=config.training_traverse,
                 map_version=record.version,
             )
-        check_alike(before, config)
-        fused, verdict = None, {"accepted": False, "why": inputs.known}
+        check_alike(old_map, config)
+        fused_map, verdict = None, {"accepted": False, "why": inputs.map_drives}
         warnings: tuple[str, ...] = ()
-        if isinstance(inputs.known, KnownDrives):
-            known, joining = self._in_space(before, inputs.known, drive)
-            fused, judged = fuse(before, known, joining, config.same_route)
-            verdict, warnings = judged.as_dict(), judged.remarks()
-        if fused is None:
-            map_ = append_drive(before, measured(drive, before.landmark_model, self.evaluator, self.progress.update))
+        if isinstance(inputs.map_drives, KnownDrives):
+            drives, new_drive = self._in_space(old_map, inputs.map_drives, drive)
+            fused_map, same_route = fuse(old_map, drives, new_drive, config.same_route)
+            verdict, warnings = same_route.as_dict(), same_route.remarks()
+        if fused_map is None:
+            map_ = append_drive(
+                old_map, measure_drive(drive, old_map.landmark_model, self.evaluator, self.progress.update)
+            )
         else:
-            map_ = fused.map
-        asked = config.as_dict()
-        added = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
-        added["fused"] = fused is not None
+            map_ = fused_map.map
+        config_document = config.as_dict()
+        entry = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
+        entry["fused"] = fused_map is not None
         # The catalog's configuration: the file of an imported map names traverses of another server.
-        config_after = {
+        new_config = {
             **record.config,
-            "n_landmarks": before.n_landmarks,
-            **{name: asked[name] for name in ("append", "check_traverse", "gate_margin", "activate")},
-            "appended": [*record.config.get("appended", ()), added],
+            "n_landmarks": old_map.n_landmarks,
+            **{name: config_document[name] for name in ("append", "check_traverse", "gate_margin", "activate")},
+            "appended": [*record.config.get("appended", ()), entry],
         }
-        weights_sha256 = drive.weights_sha256 or before.weights_sha256
+        weights_sha256 = drive.weights_sha256 or old_map.weights_sha256
         if weights_sha256 is not None:
-            config_after["weights_sha256"] = weights_sha256
-        if drive.camera is not None and drive.camera not in before.cameras:
-            config_after["cameras"] = [camera.as_dict() for camera in (*before.cameras, drive.camera)]
-        learnt = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season", "camera_of")}
-        learnt["fused"] = {**verdict, "n_new_images": map_.n_images - before.n_images}
-        learnt["warnings"] = warnings
-        checked = fused.without(frames.withheld) if fused is not None and frames.is_held_out else map_
-        return replace(map_, config=config_after), checked, config_after, learnt
+            new_config["weights_sha256"] = weights_sha256
+        if drive.camera is not None and drive.camera not in old_map.cameras:
+            new_config["cameras"] = [camera.as_dict() for camera in (*old_map.cameras, drive.camera)]
+        results = {name: record.metrics.get(name) for name in ("landmarks", "training", "second_season", "camera_of")}
+        results["fused"] = {**verdict, "n_new_images": map_.n_images - old_map.n_images}
+        results["warnings"] = warnings
+        checked_map = fused_map.without(frames.withheld) if fused_map is not None and frames.is_held_out else map_
+        return replace(map_, config=new_config), checked_map, new_config, results
 
-    def _in_space(self, before: Map, known: KnownDrives, drive: Drive) -> tuple[KnownDrives, Drive]:
-        """What a map is made of and what joins it, with what the map compares in place of encodings."""
-        of_id = {id(each): each for each in (*known.seasons, drive, known.candidates) if each is not None}
-        there = {key: compared(each, before.landmark_model, self.evaluator) for key, each in of_id.items()}
-        candidates = None if known.candidates is None else there[id(known.candidates)]
-        seasons = tuple(there[id(season)] for season in known.seasons)
-        known = replace(known, seasons=seasons, candidates=candidates, halves=self.evaluator.halves)
-        return known, there[id(drive)]
+    def _in_space(self, old_map: Map, drives: KnownDrives, drive: Drive) -> tuple[KnownDrives, Drive]:
+        """The drives that a map is made of and the one that joins it, as `drive_in_space`."""
+        by_id = {id(season): season for season in (*drives.seasons, drive, drives.candidates) if season is not None}
+        in_space = {
+            key: drive_in_space(season, old_map.landmark_model, self.evaluator) for key, season in by_id.items()
+        }
+        candidates = None if drives.candidates is None else in_space[id(drives.candidates)]
+        seasons = tuple(in_space[id(season)] for season in drives.seasons)
+        drives = replace(drives, seasons=seasons, candidates=candidates, halves=self.evaluator.halves)
+        return drives, in_space[id(drive)]

@@ -1,4 +1,4 @@
-"""What a remap is asked for, what that takes, and what can be known of it to be impossible before it begins."""
+"""The parameters of a remap, the time that it takes, and what is impossible of it, known before it begins."""
 
 import math
 from collections.abc import Mapping
@@ -36,9 +36,9 @@ class RemapConfig:
     n_landmarks: int | None = None
     list_length: int = DEFAULT_LIST_LENGTH
     relevance: Relevance = DEFAULT_RELEVANCE  # what the map is built for
-    # Of the experience database that NNQL plans by; 0: the map has none
+    # Episodes that the experience database is learnt in (NNQL plans by it); 0: the map has none
     training_episodes: int = DEFAULT_TRAINING_EPISODES
-    seed: int = 0  # of everything random in the remap
+    seed: int = 0  # seeds everything random in the remap
     # Serve the new map at once, whatever was activated while it was built: the last word wins. With a gate only in
     # place of the map it was compared with.
     activate: bool = True
@@ -87,9 +87,9 @@ class RemapConfig:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
-        """Back from the JSON form."""
-        return cls(**{**stored, "relevance": Relevance(stored["relevance"])})
+    def from_dict(cls, document: dict[str, Any]) -> Self:
+        """Read the JSON form."""
+        return cls(**{**document, "relevance": Relevance(document["relevance"])})
 
 
 def remap_stages(
@@ -100,7 +100,7 @@ def remap_stages(
     Measured with 2,000 to 26,000 frames of 64 to 4,096 numbers (docs/results/bench.md has one of them).
 
     Args:
-        n_candidates: Frames that landmarks are selected from; 0: they stay.
+        n_candidates: How many frames landmarks are selected from; 0: they stay.
         fitting: What the evaluator learns from.
     """
     n, m, dim = n_frames, n_candidates, encoding_dim
@@ -120,16 +120,16 @@ def remap_stages(
     }
 
 
-# Of a remap whose size is not known beforehand.
+# The stages of a remap whose size is not known beforehand.
 REMAP_STAGES = remap_stages(RemapConfig("drive", "another"), 5_000, 5_000, 1_000)
 
 
 def stages_in(data_dir: Path, domain: str, config: RemapConfig, fitting: Fitting = Fitting.NOTHING) -> dict[str, float]:
-    """The stages of a remap of a domain's traverses, of which no encoding is read.
+    """The stages of a remap of a domain's traverses, as `remap_stages`; reads no encodings.
 
     Raises:
-        UnknownTraverseError: There is none such.
-        DamagedFileError, UnavailableError: One cannot be read.
+        UnknownTraverseError: There is no such traverse.
+        DamagedFileError, UnavailableError: A traverse cannot be read.
     """
     with Traverse.open(data_dir, domain, config.training_traverse) as training:
         n_frames, dim = training.n_frames, training.encoding_dim or 0
@@ -141,7 +141,7 @@ def stages_in(data_dir: Path, domain: str, config: RemapConfig, fitting: Fitting
 
 
 def refuse_impossible(config: RemapConfig, n_frames: Mapping[str, int], active: Map | None) -> None:
-    """Say before the job what it would end with, as far as its traverses' numbers of frames and the active map tell.
+    """Refuse, before its job, a remap that its traverses' numbers of frames and the active map make impossible.
 
     Raises InvalidMapConfigError: a traverse is empty, there are too few landmarks, or the active map's do not fit.
     """
@@ -152,8 +152,8 @@ def refuse_impossible(config: RemapConfig, n_frames: Mapping[str, int], active: 
     elif config.landmark_traverse is not None or active is None:
         n_candidates = n_frames[config.landmark_traverse or config.training_traverse]
         check_list_length(config.list_length, fitting_number(config.n_landmarks, n_candidates, DEFAULT_N_LANDMARKS))
-    elif config.camera_of is None:  # else it shows only there whether they stay
-        base = staying(config, active)
+    elif config.camera_of is None:  # else only the remap itself finds out whether landmarks stay
+        base = staying_map(config, active)
         if base is None:
             refuse_impossible(config, n_frames, None)
         else:
@@ -166,8 +166,11 @@ def check_filled(name: str, n_frames: int) -> None:
         raise InvalidMapConfigError(f"traverse {name} has no frames yet; upload some first", traverse=name)
 
 
-def staying(config: RemapConfig, active: Map) -> Map | None:
-    """The active map, whose landmarks stay; None: they are of another kind than is asked for."""
+def staying_map(config: RemapConfig, active: Map) -> Map | None:
+    """The active map, whose landmarks stay; None: they are of another kind than is asked for.
+
+    Raises InvalidMapConfigError: another number of landmarks is asked for.
+    """
     if not config.append and is_composed(active.landmark_model) != (config.relevance is Relevance.COMPOSED):
         return None
     if config.n_landmarks not in {None, active.n_landmarks}:
@@ -179,18 +182,19 @@ def staying(config: RemapConfig, active: Map) -> Map | None:
     return active
 
 
-def check_alike(before: Map, config: RemapConfig) -> None:
-    """What describes the images of one map is the same for all of them; what is left at its default is the map's.
+def check_alike(active: Map, config: RemapConfig) -> None:
+    """Check that what is appended is to be described as the active map's images are; defaults stand for the map's.
 
     Raises InvalidMapConfigError: something else is asked for than the map has.
     """
-    asked = {
-        "n_landmarks": (config.n_landmarks, None, before.n_landmarks),
-        "list_length": (config.list_length, DEFAULT_LIST_LENGTH, before.list_length),
-        "relevance": (config.relevance.value, DEFAULT_RELEVANCE.value, before.relevance.value),
+    parameters = {
+        "n_landmarks": (config.n_landmarks, None, active.n_landmarks),
+        "list_length": (config.list_length, DEFAULT_LIST_LENGTH, active.list_length),
+        "relevance": (config.relevance.value, DEFAULT_RELEVANCE.value, active.relevance.value),
     }
-    for name, (wanted, default, has) in asked.items():
-        if wanted not in {default, has}:
+    for name, (value, default, map_value) in parameters.items():
+        if value not in {default, map_value}:
             raise InvalidMapConfigError(
-                f"the active map has {name} {has}, not {wanted}; what is appended to it must be alike", **{name: has}
+                f"the active map has {name} {map_value}, not {value}; what is appended to it must be alike",
+                **{name: map_value},
             )

@@ -33,7 +33,7 @@ from deepsimbad.errors import (
 from deepsimbad.evaluators.compute import Compute, available_cores
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.child import JobPriority
-from deepsimbad.jobs.fitting import learns
+from deepsimbad.jobs.fitting import fitting_of
 from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.jobs.remap import remap
 from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig, stages_in
@@ -46,24 +46,24 @@ from deepsimbad.store.shared_catalog import open_catalog
 _log = logging.getLogger(__name__)
 REMAP = "remap"  # the kind of job
 _MAX_WAITING = 100
-_RETRY_AFTER_S = 30  # a place is free when a job has ended, which takes longer than a query
-_WRITTEN_AGAIN_S = 1.0
+_RETRY_AFTER_S = 30  # a place is free once a job has ended, which takes longer than a query
+_RETRY_WRITE_S = 1.0
 _THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_LOOK_AGAIN_S = 0.1
-_ENDS_WITHIN_S = 10.0  # after its last word
+_POLL_S = 0.1
+_EXIT_TIMEOUT_S = 10.0  # of a child, after its last message
 
-_Written = TypeVar("_Written")
+_T = TypeVar("_T")
 RunJob: TypeAlias = Callable[[JobRecord, Callable[[ProgressState], None], Callable[[], bool]], dict[str, Any]]
-"""Does a job, whose row is the caller's to write: told of every new state, asking again and again if it is cancelled.
+"""Does a job and returns its result; calls the first function with every new state, and asks the second if to stop.
 
-Returns the job's result. Raises CancelledError, JobInterruptedError where the process that did it died, or what else is
-wrong by name.
+The caller writes the job's row. Raises CancelledError, JobInterruptedError where the process that did it died, or
+another error of the tree.
 """
 
 
-def job_threads(asked: int) -> int:
-    """The threads that a job beside a living service computes in; 0 asks for one less than there are cores."""
-    return asked or max(1, available_cores() - 1)
+def job_threads(n_threads: int) -> int:
+    """The threads that a job beside a living service computes in; 0 stands for one less than there are cores."""
+    return n_threads or max(1, available_cores() - 1)
 
 
 class JobRunner:
@@ -90,12 +90,12 @@ class JobRunner:
         self._on_activated = on_activated
         self._max_waiting = max_waiting
         self._on_ended = on_ended
-        self._submitting = threading.Lock()
-        self._waiting: queue.Queue[str | None] = queue.Queue()
-        self._cancelled: dict[str, threading.Event] = {}
+        self._submit_lock = threading.Lock()
+        self._job_queue: queue.Queue[str | None] = queue.Queue()
+        self._cancellations: dict[str, threading.Event] = {}
         self._closing = threading.Event()
         for job_id in catalog.waiting_jobs():
-            self._queue(job_id)
+            self._enqueue(job_id)
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
         self._thread.start()
 
@@ -117,8 +117,8 @@ class JobRunner:
             TooManyJobsError: As many jobs wait as may.
             UnavailableError: The service is shutting down.
         """
-        with self._submitting:
-            earlier = self.made_before(job_id, config)
+        with self._submit_lock:
+            earlier = self.earlier_job(job_id, config)
             if earlier is not None:
                 return earlier
             if self._closing.is_set():
@@ -132,13 +132,13 @@ class JobRunner:
                 )
             kind = REMAP if isinstance(config, RemapConfig) else EXPERIENCE
             job = self._catalog.create_job(domain, kind, config.as_dict(), job_id)
-            self._queue(job.job_id)
+            self._enqueue(job.job_id)
             return job
 
-    def made_before(self, job_id: str | None, config: RemapConfig | ExperienceConfig) -> JobRecord | None:
-        """The job of that id, which an earlier request made; None: there is none.
+    def earlier_job(self, job_id: str | None, config: RemapConfig | ExperienceConfig) -> JobRecord | None:
+        """The job that an earlier request of this id made; None: there is none.
 
-        Raises IdempotencyKeyReusedError: it was asked for something else.
+        Raises IdempotencyKeyReusedError: that request was for something else.
         """
         if job_id is None:
             return None
@@ -156,7 +156,7 @@ class JobRunner:
         Raises UnknownJobError: no such job.
         """
         job = self._catalog.cancel_queued_job(job_id)
-        event = self._cancelled.get(job_id)
+        event = self._cancellations.get(job_id)
         if event is not None:
             event.set()
         return job
@@ -164,50 +164,50 @@ class JobRunner:
     def close(self) -> None:
         """Stop what runs and wait for its clean end; it and what is queued are left to the next service."""
         self._closing.set()
-        self._waiting.put(None)
+        self._job_queue.put(None)
         self._thread.join()
 
-    def _queue(self, job_id: str) -> None:
-        self._cancelled[job_id] = threading.Event()
-        self._waiting.put(job_id)
+    def _enqueue(self, job_id: str) -> None:
+        self._cancellations[job_id] = threading.Event()
+        self._job_queue.put(job_id)
 
     def _run(self) -> None:
-        while (job_id := self._waiting.get()) is not None and not self._closing.is_set():
+        while (job_id := self._job_queue.get()) is not None and not self._closing.is_set():
             try:
                 self._run_one(job_id)
             except DeepSimbadError:
                 _log.exception("the state of a job could not be recorded", extra={"job_id": job_id})
             finally:
-                self._cancelled.pop(job_id, None)
+                self._cancellations.pop(job_id, None)
 
     def _run_one(self, job_id: str) -> None:
         try:
-            job = self._written(lambda: self._catalog.start_job(job_id))
+            job = self._write(lambda: self._catalog.start_job(job_id))
         except UnknownJobError:  # cancelled while it waited, and then its domain was deleted
             return
         if job.state is not JobState.RUNNING:  # cancelled while it waited
             return
-        about: dict[str, Any] = {"job_id": job_id, "domain": job.domain, "kind": job.kind}
-        _log.info("job started", extra={**about, "n_starts": job.n_starts})
-        began = time.perf_counter()
-        ending = self._ending(job, self._cancelled[job_id])
-        seconds = time.perf_counter() - began
-        about["seconds"] = round(seconds, 2)
+        log_fields: dict[str, Any] = {"job_id": job_id, "domain": job.domain, "kind": job.kind}
+        _log.info("job started", extra={**log_fields, "n_starts": job.n_starts})
+        started_s = time.perf_counter()
+        ending = self._ending(job, self._cancellations[job_id])
+        seconds = time.perf_counter() - started_s
+        log_fields["seconds"] = round(seconds, 2)
         if ending is None:
             self._catalog.give_back_job(job_id)
-            _log.info("job stopped", extra=about)
+            _log.info("job stopped", extra=log_fields)
             return
-        self._written(lambda: self._catalog.update_job(job_id, eta_s=None, **ending))
+        self._write(lambda: self._catalog.update_job(job_id, eta_s=None, **ending))
         state = ending["state"].value
         if "error" in ending:
-            about |= {"code": ending["error"]["code"], "why": ending["error"]["message"]}
+            log_fields |= {"code": ending["error"]["code"], "why": ending["error"]["message"]}
         else:
-            about |= {name: ending["result"][name] for name in ("map_version", "active")}
-        _log.info("job ended", extra={**about, "state": state})
+            log_fields |= {name: ending["result"][name] for name in ("map_version", "active")}
+        _log.info("job ended", extra={**log_fields, "state": state})
         self._on_ended(job.kind, state, seconds)
 
-    def _ending(self, job: JobRecord, cancelled: threading.Event) -> dict[str, Any] | None:
-        """Do a job; answers what its row is to say, or None where the service stops: nobody gave the job up."""
+    def _ending(self, job: JobRecord, cancellation: threading.Event) -> dict[str, Any] | None:
+        """Do a job; answers the fields of its row, or None where it ends because the service stops."""
 
         def record(state: ProgressState) -> None:
             try:
@@ -216,28 +216,30 @@ class JobRunner:
                 _log.warning("progress not recorded", extra={"job_id": job.job_id, "why": error.message})
 
         try:
-            result = self._run_job(job, record, lambda: cancelled.is_set() or self._closing.is_set())
+            result = self._run_job(job, record, lambda: cancellation.is_set() or self._closing.is_set())
             return self._succeeded(job, result)
         except DeepSimbadError as error:
             is_cancelled, has_died = isinstance(error, CancelledError), isinstance(error, JobInterruptedError)
-            about = {"job_id": job.job_id, "why": error.message}
+            log_fields = {"job_id": job.job_id, "why": error.message}
             if has_died:
-                _log.error("a job's process died", extra=about)
+                _log.error("a job's process died", extra=log_fields)
             elif not is_cancelled:
-                _log.warning("a job failed", extra={**about, "code": error.code})
-            self._written(self._clear_away)
-            if is_cancelled and not cancelled.is_set():
+                _log.warning("a job failed", extra={**log_fields, "code": error.code})
+            self._write(self._clear_away)
+            if is_cancelled and not cancellation.is_set():
                 return None
-            sealed = self._catalog.map_of_job(job.domain, job.job_id) if is_cancelled or has_died else None
-            if sealed is None or sealed.activated_at is None:
+            map_record = self._catalog.map_of_job(job.domain, job.job_id) if is_cancelled or has_died else None
+            if map_record is None or map_record.activated_at is None:
                 state = JobState.CANCELLED if is_cancelled else JobState.FAILED
                 return {"state": state, "error": {"code": error.code, "message": error.message, **error.hints}}
             # It was behind its last step.
-            return self._succeeded(job, {"map_version": sealed.version, "active": True, "metrics": sealed.metrics})
+            return self._succeeded(
+                job, {"map_version": map_record.version, "active": True, "metrics": map_record.metrics}
+            )
         except Exception:
             _log.exception("a job broke", extra={"job_id": job.job_id})
-            broken = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
-            return {"state": JobState.FAILED, "error": broken}
+            error_document = {"code": "internal_error", "message": "the job broke; the service's log tells where"}
+            return {"state": JobState.FAILED, "error": error_document}
 
     def _succeeded(self, job: JobRecord, result: dict[str, Any]) -> dict[str, Any]:
         if result["active"]:
@@ -249,8 +251,8 @@ class JobRunner:
         for line in self._catalog.discard_abandoned_maps():
             _log.info("discarded", extra={"what": line})
 
-    def _written(self, write: Callable[[], _Written]) -> _Written:
-        """Write to the catalog, and again until a full disk has room; no job waits for ever for its end to be noted.
+    def _write(self, write: Callable[[], _T]) -> _T:
+        """Write to the catalog, again and again until a full disk has room, so that a job's end is noted in the end.
 
         Raises:
             UnavailableError: The service stops meanwhile: the next one finds the job as it stands.
@@ -263,7 +265,7 @@ class JobRunner:
                 raise
             except UnavailableError as error:
                 _log.warning("the catalog cannot be written", extra={"why": error.message})
-                if self._closing.wait(_WRITTEN_AGAIN_S):
+                if self._closing.wait(_RETRY_WRITE_S):
                     raise
 
 
@@ -272,7 +274,7 @@ class InThisProcess:
     """Does jobs in the caller's thread, as `RunJob`: in a job's own process, and for tests."""
 
     data_dir: Path  # the catalog and the sessions in it are opened anew
-    n_threads: int = 1  # to compute in
+    n_threads: int = 1  # that it computes in
     compute: Compute = field(default_factory=Compute)  # how networks are computed, where an evaluator is fitted
 
     def __call__(
@@ -289,7 +291,7 @@ class InThisProcess:
                 Progress({}, None, is_cancelled).check()
                 evaluator = make_evaluator(evaluator_config(catalog.domain(job.domain).evaluator), self.compute)
                 try:
-                    stages = stages_in(self.data_dir, job.domain, config, learns(evaluator, config.relevance))
+                    stages = stages_in(self.data_dir, job.domain, config, fitting_of(evaluator, config.relevance))
                 except DeepSimbadError:  # the stage that needs the traverse will say so
                     stages = REMAP_STAGES
                 progress = Progress(stages, on_progress, is_cancelled)
@@ -392,7 +394,7 @@ class InAnotherProcess:
         line: bytes | None = b""
         while line is not None:
             try:
-                line = lines.get(timeout=_LOOK_AGAIN_S)
+                line = lines.get(timeout=_POLL_S)
             except queue.Empty:
                 line = b""
             if line and line.strip():
@@ -419,18 +421,18 @@ def _send(child: "subprocess.Popen[bytes]", line: bytes) -> None:
 
 
 def _end(child: "subprocess.Popen[bytes]") -> None:
-    """Nothing of a child is left, whatever happened."""
+    """Leave nothing of a child, whatever happened."""
     if child.stdin is not None:
         child.stdin.close()
     try:
-        child.wait(_ENDS_WITHIN_S)
+        child.wait(_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         child.kill()
         child.wait()
 
 
 def _death(code: int, is_cancelled: bool) -> DeepSimbadError:
-    """Why a child ended without a last word."""
+    """The error for a child that ended without a result or an error."""
     if is_cancelled:
         return CancelledError("cancelled; it was killed, because it did not stop by itself")
     if code >= 0:
@@ -439,8 +441,8 @@ def _death(code: int, is_cancelled: bool) -> DeepSimbadError:
         name = signal.Signals(-code).name
     except ValueError:  # a real-time signal
         name = f"signal {-code}"
-    why = ", as the system does where memory runs out" if -code == signal.SIGKILL else ""
-    return JobInterruptedError(f"the job's process was ended by {name}{why}: start it again", signal=name)
+    explanation = ", as the system does where memory runs out" if -code == signal.SIGKILL else ""
+    return JobInterruptedError(f"the job's process was ended by {name}{explanation}: start it again", signal=name)
 
 
 def _log_here(record: dict[str, Any], job_id: str) -> None:

@@ -61,26 +61,26 @@ def seal_version(
     """
     version = catalog.begin_map(domain, dict(config))
     try:
-        building, sealed = catalog.building_path(domain, version), catalog.map_path(domain, version)
+        building, sealed_path = catalog.building_path(domain, version), catalog.map_path(domain, version)
         created_at = datetime.now(UTC).isoformat(timespec="seconds")
         write_map(building, replace(map_, domain=domain, version=version, created_at=created_at), on_progress)
-        digest, n_bytes = seal(building, sealed)
-        bits = 8 * index_bytes(sealed) / map_.n_images
+        digest, n_bytes = seal(building, sealed_path)
+        bits = 8 * index_bytes(sealed_path) / map_.n_images
         on_progress(1.0)
-        measured = {**metrics, "index_bits_per_map_image": bits, "job_id": job_id}
-        return catalog.seal_map(domain, version, digest, n_bytes, measured)
+        all_metrics = {**metrics, "index_bits_per_map_image": bits, "job_id": job_id}
+        return catalog.seal_map(domain, version, digest, n_bytes, all_metrics)
     except BaseException:
         catalog.discard_map(domain, version)
         raise
 
 
-def activate_once(catalog: Catalog, domain: str, sealed: MapRecord, expected: int | AnyVersion | None) -> None:
-    """Let a version serve that a job sealed, unless that was done before the job was interrupted.
+def activate_once(catalog: Catalog, domain: str, record: MapRecord, expected: int | AnyVersion | None) -> None:
+    """Let a version that a job sealed serve, unless it did before the job was interrupted.
 
     Raises LostActivationError: another version is active than the expected one.
     """
-    if sealed.activated_at is None:  # else it served already, and whoever rolled it back since meant it
-        catalog.activate(domain, sealed.version, expected)
+    if record.activated_at is None:  # else it served already, and whoever rolled it back since meant it
+        catalog.activate(domain, record.version, expected)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class ExperienceConfig:
 
     @classmethod
     def of(cls, session_id: str, positions_m: Sequence[float | None]) -> Self:
-        """Of a request that tells of true positions."""
+        """From a request's true positions, which are None where unknown."""
         body = json.dumps(list(positions_m)).encode()  # NaN, which is refused later, has a form as well
         return cls(session_id, hashlib.sha256(body).hexdigest())
 
@@ -109,28 +109,28 @@ def keep_true_positions(
     positions_m: Sequence[float | None],
     received_at: float,
 ) -> NDArray[np.float64] | None:
-    """Keep where a session's robot truly was; an ended session may still be told of.
+    """Keep where a session's robot truly was, though the session may have ended.
 
     Args:
-        positions_m: One for every observation; None where it is unknown.
+        positions_m: The position at every observation; None where it is unknown.
         received_at: Seconds since 1970.
 
     Returns:
         What had been kept before, if anything: [n] positions of the first n observations, NaN where unknown.
 
     Raises:
-        UnknownDomainError, UnknownSessionError: There is none such, or the session ended long ago.
+        UnknownDomainError, UnknownSessionError: There is no such domain or session, or the session ended long ago.
         NoActiveMapError: There is no map that could learn.
-        InvalidInputError: As many positions as observations there are not, or one is not finite.
+        InvalidInputError: There are not as many positions as observations, or one is not finite.
         ConflictError: The session was begun on a map of other landmarks than the one that serves.
         RetiredMapError, DamagedMapError: Its map is no more, or cannot be read.
     """
-    active = catalog.domain(domain).active_version
+    active_version = catalog.domain(domain).active_version
     record = _session_of(store, domain, session_id)
-    if active is None:
+    if active_version is None:
         raise NoActiveMapError(f"domain {domain} has no active map that could learn")
     truth_m = checked_truths(positions_m, store.n_observations(record.number))
-    _check_landmarks(catalog, record, active)
+    _check_landmarks(catalog, record, active_version)
     return store.save_true_positions(record.number, truth_m, received_at).result()
 
 
@@ -139,7 +139,8 @@ def walks_of(store: SessionStore, catalog: Catalog, domain: str, session_id: str
 
     Raises:
         InvalidInputError: Its true positions were never fed back.
-        UnknownDomainError, UnknownSessionError, ConflictError, RetiredMapError, DamagedMapError: As above.
+        UnknownDomainError, UnknownSessionError, ConflictError, RetiredMapError, DamagedMapError: As
+            `keep_true_positions`.
     """
     record = _session_of(store, domain, session_id)
     truth_m = store.true_positions(record.number)
@@ -171,22 +172,26 @@ def _session_of(store: SessionStore, domain: str, session_id: str) -> SessionRec
     return record
 
 
-def _check_landmarks(catalog: Catalog, record: SessionRecord, active: int | None) -> None:
-    """What a session kept are ranks of its own map's landmarks; another map's cannot be compared with them."""
+def _check_landmarks(catalog: Catalog, record: SessionRecord, active_version: int | None) -> None:
+    """Check that the active map has the landmarks that a session's views were ranked by; raises ConflictError, ..."""
     try:
-        is_kept = catalog.map(record.domain, record.map_version).sha256 == record.map_sha256
+        is_same_file = catalog.map(record.domain, record.map_version).sha256 == record.map_sha256
     except UnknownMapVersionError as error:
         raise retired(record.domain, record.map_version) from error
-    if not is_kept:  # the domain was deleted since and made anew
+    if not is_same_file:  # the domain was deleted since and made anew
         raise retired(record.domain, record.map_version)
-    if active is None or record.map_version == active:
+    if active_version is None or record.map_version == active_version:
         return
-    ours, theirs = (_landmarks(catalog, record.domain, version) for version in (record.map_version, active))
-    if ours.keys() != theirs.keys() or not all(np.array_equal(ours[name], theirs[name]) for name in ours):
+    session_model, active_model = (
+        _landmarks(catalog, record.domain, version) for version in (record.map_version, active_version)
+    )
+    if session_model.keys() != active_model.keys() or not all(
+        np.array_equal(session_model[name], active_model[name]) for name in session_model
+    ):
         raise ConflictError(
-            f"session {record.session_id} was begun on map {record.map_version}; map {active}, which serves, has other "
-            "landmarks and cannot learn from it",
-            map_version=active,
+            f"session {record.session_id} was begun on map {record.map_version}; map {active_version}, which serves, "
+            "has other landmarks and cannot learn from it",
+            map_version=active_version,
         )
 
 
@@ -213,12 +218,12 @@ def learn_online(
         NoActiveMapError: There is no map that could learn.
         LostActivationError: Another map was activated meanwhile.
     """
-    active = catalog.domain(domain).active_version
-    if active is None:
+    active_version = catalog.domain(domain).active_version
+    if active_version is None:
         raise NoActiveMapError(f"domain {domain} has no active map that could learn")
     progress.stage("read map")
-    before = catalog.map(domain, active)
-    map_ = read_map(catalog.map_file(domain, active))
+    active_record = catalog.map(domain, active_version)
+    map_ = read_map(catalog.map_file(domain, active_version))
     progress.stage("learn")
     config, n_moves = NnqlConfig(), 0
     if map_.q_values is None:
@@ -230,23 +235,23 @@ def learn_online(
         learn(q_values, moves, config)
         n_moves += moves.action.size
     progress.stage("seal")
-    experience = {"from_version": active, "n_walks": len(walks), "n_moves": n_moves}
-    metrics = {**before.metrics, "experience": experience}
-    learnt = replace(map_, q_values=q_values)
-    sealed = seal_version(catalog, domain, learnt, before.config, metrics, progress.update, job_id)
-    return serve_learnt(catalog, domain, sealed, progress)
+    experience = {"from_version": active_version, "n_walks": len(walks), "n_moves": n_moves}
+    metrics = {**active_record.metrics, "experience": experience}
+    learnt_map = replace(map_, q_values=q_values)
+    new_record = seal_version(catalog, domain, learnt_map, active_record.config, metrics, progress.update, job_id)
+    return serve_learnt(catalog, domain, new_record, progress)
 
 
-def serve_learnt(catalog: Catalog, domain: str, sealed: MapRecord, progress: Progress) -> dict[str, Any]:
-    """The last stage of `learn_online`, and all that is left of a job that was interrupted after it sealed."""
+def serve_learnt(catalog: Catalog, domain: str, record: MapRecord, progress: Progress) -> dict[str, Any]:
+    """The last stage of `learn_online`, which is all that a job has left to do that was interrupted after it sealed."""
     progress.stage("activate")
-    activate_once(catalog, domain, sealed, sealed.metrics["experience"]["from_version"])
-    return {"map_version": sealed.version, "active": True, "metrics": sealed.metrics}
+    activate_once(catalog, domain, record, record.metrics["experience"]["from_version"])
+    return {"map_version": record.version, "active": True, "metrics": record.metrics}
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What was imported as which version, whether it serves, and whether the domain is new."""
+    """An imported map's domain and version, whether it serves (`active`), and whether the domain is new."""
 
     domain: str
     map_version: int
@@ -262,7 +267,7 @@ def import_map(
     """Take over a map file that another server exported; the file stays.
 
     Args:
-        domain: What the domain is called here; None: as there. It is made if it is absent.
+        domain: What the domain is called here (None: as there), made if it is absent.
         sha256: The digest in hex that the file must have; None: any.
 
     Raises:
@@ -272,7 +277,7 @@ def import_map(
         UnavailableError: The disk is full, ...
     """
     digest, map_ = _read(file, sha256)
-    measured = {"n_map_images": map_.n_images, "index_bits_per_map_image": map_.index_bits_per_map_image}
+    measures = {"n_map_images": map_.n_images, "index_bits_per_map_image": map_.index_bits_per_map_image}
     config = {name: value for name, value in map_.config.items() if name != "appended"}
     config |= dict.fromkeys(TRAVERSE_ROLES)
     config["imported"] = {"domain": map_.domain, "version": map_.version, "sha256": digest}
@@ -282,7 +287,7 @@ def import_map(
     try:
         version = catalog.begin_map(name, config)
         n_bytes = adopt(file, catalog.map_path(name, version), digest)
-        catalog.seal_map(name, version, digest, n_bytes, {**map_.metrics, **measured})
+        catalog.seal_map(name, version, digest, n_bytes, {**map_.metrics, **measures})
     except BaseException:
         if version is not None:
             catalog.discard_map(name, version)
@@ -296,7 +301,7 @@ def import_map(
 
 
 def _read(file: Path, sha256: str | None) -> tuple[str, Map]:
-    """Digest of a file, and the map in it, which can serve here."""
+    """The digest of a map file in hex, and its map, which can serve here; raises InvalidArchiveError."""
     try:
         digest = sha256_of(file)
     except OSError as error:
@@ -310,6 +315,6 @@ def _read(file: Path, sha256: str | None) -> tuple[str, Map]:
         map_.check()
         make_evaluator(evaluator_config(map_.evaluator)).check_model(map_.landmark_model, map_.n_landmarks)
     except (DeepSimbadError, KeyError, TypeError, ValueError, OverflowError) as error:
-        why = error.message if isinstance(error, DeepSimbadError) else "its parts contradict each other"
-        raise InvalidArchiveError(f"{file} is no map that can serve here: {why}", file=str(file)) from error
+        reason = error.message if isinstance(error, DeepSimbadError) else "its parts contradict each other"
+        raise InvalidArchiveError(f"{file} is no map that can serve here: {reason}", file=str(file)) from error
     return digest, map_

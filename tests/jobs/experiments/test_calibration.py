@@ -16,7 +16,7 @@ from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import InvalidMapConfigError
-from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.jobs.experiments.calibration import (
     CalibrationConfig,
     Sight,
@@ -109,7 +109,7 @@ def test_views_until_found():
 
 def test_robots_look_where_they_are_and_report_their_moves(report, drives, evaluator, localizer):
     map_, algorithm = localizer
-    views = views_of(measured(drives[2], map_.landmark_model, evaluator))
+    views = views_of(measure_drive(drives[2], map_.landmark_model, evaluator))
     for stage, moved_m in (("moves of 3 m", 3.0), ("odometry times 0.9", 4.5), ("odometry times 1.1", 5.5)):
         seen, state, start = report.sights[stage], algorithm.start(), 4
         step_m = 3 if stage.startswith("moves") else 5
@@ -135,7 +135,7 @@ def test_how_many_robots_and_views_there_are(report):
 
 def test_a_move_past_the_end_is_refused_and_changes_nothing(drives, evaluator, localizer):
     map_, algorithm = localizer
-    views = views_of(measured(drives[2], map_.landmark_model, evaluator))
+    views = views_of(measure_drive(drives[2], map_.landmark_model, evaluator))
     course = _Course(algorithm, DrivenByTest(views, drives[2].route(), np.arange(N)), QUICK)
     path_m = np.r_[N - 51 + 5.0 * np.arange(11), N - 1.0][np.newaxis]
     seen = course.driven(path_m, np.r_[np.full(11, 5.0), N + 30.0], lambda _: None)

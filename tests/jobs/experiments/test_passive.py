@@ -7,7 +7,7 @@ from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.jobs.build import measured, views_of
+from deepsimbad.jobs.build import measure_drive, views_of
 from deepsimbad.jobs.experiments import passive
 
 N = 60
@@ -22,7 +22,7 @@ def driven(evaluator):
     mixed = np.where(np.arange(seen.size)[:, np.newaxis] % 2, (place[seen + 1] + place[seen + 2]) / 2, place[seen])
     test = drive_of(mixed + rng.normal(size=mixed.shape), 1.5)
     map_ = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0, 2.0)), drive_of(place, 1.0), None, None, 40).map
-    views = views_of(measured(test, map_.landmark_model, evaluator))
+    views = views_of(measure_drive(test, map_.landmark_model, evaluator))
     truth = [np.flatnonzero(np.abs(map_.position_m - at_m) <= 1.0) for at_m in test.position_m]
     live, rows = map_.live_statistics, []
     for frame in range(test.n_frames):
@@ -91,7 +91,7 @@ def test_of_a_long_drive_some_windows_are_compared(monkeypatch, evaluator):
     map_ = compose_map(
         MapPlan(Relevance.COMPOSED, 4, (1.0,)), own := drive_of(rng.normal(size=(N, 12)), 1.0), None, None, 20
     ).map
-    views = views_of(measured(own, map_.landmark_model, evaluator))
+    views = views_of(measure_drive(own, map_.landmark_model, evaluator))
     truth = [np.array([frame]) for frame in range(N)]
     scores = passive.drive_in_order(map_, views, own.position_m, np.zeros((N, N)), truth, lambda _: None)
     assert [scores.by_window[passive.FILTER][n].n_queries for n in passive.WINDOWS] == [5, 4, 4, 4, 3]

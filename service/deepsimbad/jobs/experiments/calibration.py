@@ -20,7 +20,7 @@ from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidMapConfigError, PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.jobs.experiments.nbv import TestDrive
 from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.fitting import Fitter, Pictures
@@ -222,7 +222,7 @@ def _course(
 ) -> _Course:
     # Nobody follows its plans, and a constant planner's cost nothing.
     used = LocalizerConfig(filter=config.filter, planner=f"{CONSTANT}:{_MOVE_M:g}", seed=config.seed)
-    views = views_of(measured(test, built.map.landmark_model, evaluator))
+    views = views_of(measure_drive(test, built.map.landmark_model, evaluator))
     return _Course(ActiveLocalizer(built.map, used), TestDrive(views, test.route(), true_image), config)
 
 

@@ -25,7 +25,7 @@ from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import available_cores
-from deepsimbad.jobs.build import build, measured, train_nnql, views_of
+from deepsimbad.jobs.build import build, measure_drive, train_nnql, views_of
 from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
@@ -278,7 +278,7 @@ def run_nbv(
         )
         progress.stage(f"train ({name})")
         setup = trained(config, name, built, progress.update)
-        views = views_of(measured(test, setup.map.landmark_model, evaluator))
+        views = views_of(measure_drive(test, setup.map.landmark_model, evaluator))
         drive = TestDrive(views, test.route(), nearest_images(test, training))
         results[name] = {}
         for planner in planner_names(config):

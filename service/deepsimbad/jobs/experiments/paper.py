@@ -22,8 +22,8 @@ from deepsimbad.core.planners import DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.build import measured, views_of
-from deepsimbad.jobs.experiments.kept import KeptResults, code_digest, drive_digest
+from deepsimbad.jobs.build import measure_drive, views_of
+from deepsimbad.jobs.experiments.cache import ResultCache, code_digest, drive_digest
 from deepsimbad.jobs.experiments.nbv import (
     BLOCK_M,
     CLAIRVOYANT,
@@ -134,7 +134,7 @@ class Pair:
         self._listed: dict[int, dict[Relevance, Built]] = {}  # the maps of the list length under way
         self._views = {triplet[2]: ViewsOf(drives[triplet[2]], evaluator) for triplet in triplets}
 
-    def measure(self, kept: KeptResults, shares: Shares) -> dict[str, Document]:
+    def measure(self, kept: ResultCache, shares: Shares) -> dict[str, Document]:
         """Everything, or what is kept of it, by triplet."""
         config, results = self._config, {"-".join(triplet): dict[str, Any]() for triplet in self._triplets}
 
@@ -254,7 +254,7 @@ class Pair:
         state, at_m, took = localizer.start(), float(test.position_m[0]), []
         for row in range(min(_TIMED_VIEWS, test.n_frames)):
             began = time.perf_counter()
-            view = views_of(measured(test.at(np.array([row])), setup.map.landmark_model, self._evaluator)).at(0)
+            view = views_of(measure_drive(test.at(np.array([row])), setup.map.landmark_model, self._evaluator)).at(0)
             describe_ms = 1000 * (time.perf_counter() - began)
             step = localizer.step(state, view, float(test.position_m[row]) - at_m)
             state, at_m = step.state, float(test.position_m[row])
@@ -302,7 +302,7 @@ def measure_paper(
         pictures: Of the drives, for evaluators that are fitted to images.
     """
     digests = {season: drive_digest(drive) for season, drive in drives.items()}
-    kept = KeptResults(folder, {**made_of, "code": code_digest()})
+    kept = ResultCache(folder, {**made_of, "code": code_digest()})
     works = [Pair(config, evaluator, triplets, drives, digests, pictures) for triplets in _pairs(drives)]
     n_frames = {season: drive.n_frames for season, drive in drives.items()}
     shares = Shares(tell, seconds_to_measure(config, n_frames))

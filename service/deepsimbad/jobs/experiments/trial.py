@@ -20,7 +20,7 @@ from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query
 from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.jobs.build import build, measured, views_of
+from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all, told
 from deepsimbad.jobs.fitting import Fitter, Pictures
@@ -121,7 +121,7 @@ def run_trial(
     fitter = Fitter(evaluator, pictures)
     built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
     progress.stage("localize")
-    views = views_of(measured(queries, built.map.landmark_model, evaluator))
+    views = views_of(measure_drive(queries, built.map.landmark_model, evaluator))
     scorer, by_all, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
     nearest, beliefs, n_forgot = nearest_images(queries, database), [], 0
     whole = relevances_by_all(built, views, moves_between(queries), stateless=False)

@@ -23,14 +23,14 @@ def nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     return nearest
 
 
-def known_drives(test: Drive, **others: Drive | None) -> list[str]:
-    """A warning for every other drive that the test drive's frames are of, whatever it is called."""
+def test_drive_warnings(test: Drive, **drives: Drive | None) -> list[str]:
+    """A warning for every other drive, by its role, that most frames of the test drive are in."""
     digests = test.digests()
     return [
         f"test_drive_known: most frames of the test drive are in the {role} drive too, so that the figures flatter: "
         "what was learnt from is no test; give a drive of another day"
-        for role, other in others.items()
-        if other is not None and np.isin(digests, other.digests()).mean() > _MOSTLY
+        for role, drive in drives.items()
+        if drive is not None and np.isin(digests, drive.digests()).mean() > _MOSTLY
     ]
 
 
@@ -68,15 +68,15 @@ def read_ground_truth(
     rows = _load(path)
     try:
         if rows.dtype == object and rows.ndim == 2 and rows.shape[1] == 2:
-            accepted = {int(query): _frames(truth) for query, truth in rows}
+            accepted_frames = {int(query): _frames(truth) for query, truth in rows}
         else:
             lists = map(np.flatnonzero, rows) if _says_which(rows) else rows
-            accepted = {query: _frames(truth) for query, truth in enumerate(lists)}
+            accepted_frames = {query: _frames(truth) for query, truth in enumerate(lists)}
     except (TypeError, ValueError) as error:
         raise InvalidSourceError(f"{path} holds no lists of frame numbers: {error}") from error
     place_of = {int(index): place for place, index in enumerate(training_index)}
     return [
-        np.array(sorted(place_of[t] for t in accepted.get(int(index), ()) if t in place_of), np.int64)
+        np.array(sorted(place_of[t] for t in accepted_frames.get(int(index), ()) if t in place_of), np.int64)
         for index in test_index
     ]
 

@@ -21,7 +21,7 @@ from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, LiveStatistics, Query, Relevance
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator, LandmarkModel
-from deepsimbad.jobs.build import EncodedRecording, build, measured, views_of
+from deepsimbad.jobs.build import EncodedRecording, build, measure_drive, views_of
 from deepsimbad.jobs.experiments.passive import PassiveScores, drive_in_order
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
@@ -210,7 +210,7 @@ class ViewsOf:
         for known, views in self._known:
             if known.keys() == model.keys() and all(known[name] is model[name] for name in known):
                 return views
-        views = views_of(measured(self.drive, model, self._evaluator))
+        views = views_of(measure_drive(self.drive, model, self._evaluator))
         self._known.append((model, views))
         return views
 

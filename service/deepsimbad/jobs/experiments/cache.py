@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import deepsimbad
 from deepsimbad.core.drive import Drive
-from deepsimbad.jobs.build import Kept
+from deepsimbad.jobs.build import EncodingCache
 from deepsimbad.store.arrays import is_halvable
 from deepsimbad_client.recordings import stamp_of
 
@@ -23,23 +23,23 @@ _LEAST_NEW, _NEW_SHARE = 500, 4  # frames, or a quarter of those written: the wh
 
 
 @contextmanager
-def kept_encodings(folder: Path, role: str, **made_of: Any) -> Iterator[Kept]:
-    """What `folder` keeps of a role, to be used and added to; written back at the end, after a Ctrl-C too.
+def open_encoding_cache(folder: Path, role: str, **ingredients: Any) -> Iterator[EncodingCache]:
+    """The encodings that `folder` keeps for a role, to be read and added to; written back at the end, or on Ctrl-C.
 
     Args:
-        made_of: All that encodings depend on beside the images; another value, and nothing is kept. `source` is the
-            recording, which may be one file.
+        ingredients: All that encodings depend on beside the images: where one has changed the cache begins empty.
+            `source` is the recording, which may be one file.
     """
-    made_of["file"] = stamp_of(Path(made_of["source"].partition("#")[0]))
-    kept = _KeptInFile(folder / f"{role}-encodings.npz", json.dumps(made_of, sort_keys=True, default=str))
+    ingredients["file"] = stamp_of(Path(ingredients["source"].partition("#")[0]))
+    encodings = _EncodingFile(folder / f"{role}-encodings.npz", json.dumps(ingredients, sort_keys=True, default=str))
     try:
-        yield kept
+        yield encodings
     finally:
-        kept.write()
+        encodings.write()
 
 
-class _KeptInFile(UserDict[str, tuple[NDArray[np.float32], bool]]):
-    """As `Kept`, written back now and then too, for a run that is killed."""
+class _EncodingFile(UserDict[str, tuple[NDArray[np.float32], bool]]):
+    """An `EncodingCache` that is written to its file now and then, for a run that is killed."""
 
     def __init__(self, file: Path, identity: str) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class _KeptInFile(UserDict[str, tuple[NDArray[np.float32], bool]]):
             self.write()
 
     def write(self) -> None:
-        """By another name first, so that what is there is always whole."""
+        """Write the file under another name first, so that the one that is there is always whole."""
         if len(self) == self._n_written:
             return
         encodings = np.stack([encoding for encoding, _ in self.values()])
@@ -79,40 +79,40 @@ def _read(file: Path, identity: str) -> dict[str, tuple[NDArray[np.float32], boo
 
 
 @dataclass(frozen=True)
-class KeptResults:
-    """Results in a folder, a file each, under a digest of all that they were made of: another never stands for one."""
+class ResultCache:
+    """Results in a folder, one file each, under a digest of their `ingredients`, so that none stands for another."""
 
     folder: Path
-    made_of: Mapping[str, Any]  # by all of them
+    ingredients: Mapping[str, Any]  # by all of them
 
-    def file(self, name: str, **made_of: Any) -> Path:
-        """Where a result is, or will be."""
-        identity = json.dumps({**self.made_of, **made_of}, sort_keys=True, default=str)
+    def file(self, name: str, **ingredients: Any) -> Path:
+        """The path of a result, which need not be there yet."""
+        identity = json.dumps({**self.ingredients, **ingredients}, sort_keys=True, default=str)
         return self.folder / f"{name}-{sha256(identity.encode()).hexdigest()[:16]}.json"
 
-    def get(self, name: str, make: Callable[[], dict[str, Any]], **made_of: Any) -> dict[str, Any]:
-        """What was kept, else what `make` makes, which is kept from now on."""
-        file = self.file(name, **made_of)
+    def get(self, name: str, make: Callable[[], dict[str, Any]], **ingredients: Any) -> dict[str, Any]:
+        """Read a result, or `make` and store it."""
+        file = self.file(name, **ingredients)
         try:
-            kept: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            result: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError):  # not there, or cut short
-            kept = make()
+            result = make()
             file.parent.mkdir(parents=True, exist_ok=True)
             part = file.with_suffix(".part")
-            part.write_text(json.dumps(kept), encoding="utf-8")
+            part.write_text(json.dumps(result), encoding="utf-8")
             part.replace(file)
-        return kept
+        return result
 
 
 def code_digest() -> str:
-    """Of the sources that figures depend on: a later release, or a line changed, measures anew."""
+    """SHA-256 in hex of the sources that figures depend on: a later release, or a changed line, measures anew."""
     root = Path(deepsimbad.__file__).parent
     files = sorted(file for part in ("core", "evaluators", "jobs") for file in (root / part).rglob("*.py"))
     return sha256(b"".join(file.read_bytes() for file in files if file.stem != "paper_report")).hexdigest()
 
 
 def drive_digest(drive: Drive) -> str:
-    """Of all that figures depend on."""
+    """SHA-256 in hex of the arrays of a drive that figures depend on."""
     digest = sha256()
     for array in (drive.encodings, drive.position_m, drive.x_m, drive.y_m):
         digest.update(np.ascontiguousarray(array).tobytes())
