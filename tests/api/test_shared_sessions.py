@@ -14,7 +14,7 @@ from deepsimbad.jobs.runner import InThisProcess
 from deepsimbad.store import shared_sessions
 from deepsimbad.store.objects import Objects
 from deepsimbad.store.shared_sessions import SharedSessionStore
-from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings, until
+from tests.contract.conftest import N_LANDMARKS, Client, path_of, problem, service, small_settings, wait_until
 
 pytest.importorskip("obstore", reason="the extra `objects` is not installed")
 
@@ -204,7 +204,7 @@ def test_who_takes_a_session_over_follows_it_from_its_newest_snapshot(nodes, tmp
     for seed in range(20):
         answer = observe(node_a, path, seed)
     session_id = path.rpartition("/")[2]
-    until((tmp_path / "shared/snapshots" / session_id).exists)
+    wait_until((tmp_path / "shared/snapshots" / session_id).exists)
     node_b = nodes("b")
     assert lasting_answer(node_b.get(path).json()) == lasting_answer(answer)
     store = node_b.services.session_store

@@ -38,9 +38,9 @@ def pytest_collection_modifyitems(items):
         item.add_marker(pytest.mark.filterwarnings("ignore::ResourceWarning"))
 
 
-def small_settings(data_dir, **more):
+def small_settings(data_dir, **settings):
     limits = {"max_image_bytes": 200_000, "max_json_bytes": 50_000, "max_batch_bytes": 500_000, "max_pixels": 300_000}
-    return Settings(data_dir=data_dir, event_poll_s=0.01, **{**limits, **more})
+    return Settings(data_dir=data_dir, event_poll_s=0.01, **{**limits, **settings})
 
 
 def problem(answer, status, code):
@@ -49,15 +49,15 @@ def problem(answer, status, code):
     assert answer.headers["content-type"] == "application/problem+json"
     document = answer.json()
     assert {"title", "detail", "instance"} <= set(document)
-    about = {"type": f"urn:deepsimbad:problem:{code}", "status": status, "code": code}
-    assert document == {**document, **about, "request_id": answer.headers["x-request-id"]}
+    expected = {"type": f"urn:deepsimbad:problem:{code}", "status": status, "code": code}
+    assert document == {**document, **expected, "request_id": answer.headers["x-request-id"]}
     assert "Traceback" not in answer.text
     return document
 
 
-def until(met):
+def wait_until(condition):
     for _ in range(12_000):
-        if met():
+        if condition():
             return
         time.sleep(0.04)  # to ask costs as much as a small job does
     raise AssertionError("it did not come about")
@@ -75,8 +75,8 @@ def picture(seed):
 
 
 def encoded(image, extension=".jpg"):
-    done, body = cv2.imencode(extension, image)
-    assert done
+    is_encoded, body = cv2.imencode(extension, image)
+    assert is_encoded
     return body.tobytes()
 
 
@@ -85,10 +85,10 @@ def ready_encodings():
 
 
 def operations(document):
-    """Method, path, a body that would be taken and its type, of all that the OpenAPI document lists."""
+    """Method, path with its required query, an acceptable body and its type, of every operation of the document."""
     for path, by_method in document["paths"].items():
         for method, operation in by_method.items():
-            required = [each for each in operation.get("parameters", ()) if each["in"] == "query" and each["required"]]
+            required = [row for row in operation.get("parameters", ()) if row["in"] == "query" and row["required"]]
             query = "&".join(f"{parameter['name']}={parameter['example']}" for parameter in required)
             content = operation.get("requestBody", {"content": {"": {}}})["content"]
             example = {"encoding": [1.0] * DIM}
@@ -105,28 +105,28 @@ class Caller(httpx2.Client):
         """A job when it has ended."""
         job = {}
 
-        def ended():
+        def has_ended():
             job.update(self.get(f"/v1/admin/jobs/{job_id}").json())
             return job["state"] in {"succeeded", "failed", "cancelled"}
 
-        until(ended)
+        wait_until(has_ended)
         return job
 
     def remap(self, domain, **config):
-        """The job when it has ended; of the traverse `drive` unless told otherwise."""
+        """A remap's job when it has ended; of the traverse `drive` unless `config` names another."""
         answer = self.post(f"/v1/admin/domains/{domain}/remaps", json={"training_traverse": "drive", **config})
         assert answer.status_code == 202, answer.text
         return self.wait_for(answer.json()["job_id"])
 
-    def upload(self, domain, name, encodings, position_m, /, **more):
+    def upload(self, domain, name, encodings, position_m, /, **columns):
         base = f"/v1/admin/domains/{domain}/traverses"
         assert self.post(base, json={"name": name}).status_code == 201
-        batch = npz(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **more)
-        stored = self.post(f"{base}/{name}/frames", content=batch, headers=NPZ)
-        assert stored.status_code == 200, stored.text
+        batch = npz(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **columns)
+        answer = self.post(f"{base}/{name}/frames", content=batch, headers=NPZ)
+        assert answer.status_code == 200, answer.text
 
     def upload_pictures(self, domain, name):
-        """The statuses of the answers."""
+        """Upload a drive of pictures; the statuses of the answers."""
         frames = f"/v1/admin/domains/{domain}/traverses/{name}/frames"
         self.post(f"/v1/admin/domains/{domain}/traverses", json={"name": name})
         return [
@@ -199,7 +199,7 @@ def service(data_dir, run_job=None, **settings):
 
 @pytest.fixture
 def one_process():
-    """For what takes hold of the process that answers, or of its threads."""
+    """Skips tests of a fleet that take hold of the process that answers, or of its threads."""
     if IS_FLEET:
         pytest.skip("takes hold of the process that answers")
 

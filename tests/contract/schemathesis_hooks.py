@@ -19,8 +19,8 @@ def _images(extension):
         pixels = np.random.default_rng(seed).integers(0, 255, (24, 32, 3), np.uint8)
         return bytes(cv2.imencode(extension, pixels)[1].tobytes())
 
-    whole = st.integers(0, 9).map(image)
-    return st.one_of(whole, st.binary(max_size=64), st.tuples(whole, st.integers(0, 200)).map(lambda c: c[0][: c[1]]))
+    images = st.integers(0, 9).map(image)
+    return st.one_of(images, st.binary(max_size=64), st.tuples(images, st.integers(0, 200)).map(lambda c: c[0][: c[1]]))
 
 
 def _batch(n):

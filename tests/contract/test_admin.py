@@ -40,23 +40,23 @@ def test_a_domain_is_made_once(client):
     assert (first.status_code, again.status_code) == (201, 200)
     assert first.json() == again.json() == client.get("/v1/domains/once").json()
     assert first.json()["actions_m"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
-    made = client.put("/v1/admin/domains/defaults", json={"evaluator": {"kind": "feature_l2"}})
-    written_out = {"evaluator": made.json()["evaluator"]}
+    answer = client.put("/v1/admin/domains/defaults", json={"evaluator": {"kind": "feature_l2"}})
+    written_out = {"evaluator": answer.json()["evaluator"]}
     assert client.put("/v1/admin/domains/defaults", json=written_out).status_code == 200
 
 
 def test_a_limit_on_domains(tmp_path):
     with service(tmp_path, max_domains=2) as client:
-        made = [client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS) for name in ("a", "b", "c", "b")]
-        assert [answer.status_code for answer in made] == [201, 201, 409, 200]
-        assert problem(made[2], 409, "too_many_domains")["max_domains"] == 2
+        answers = [client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS) for name in ("a", "b", "c", "b")]
+        assert [answer.status_code for answer in answers] == [201, 201, 409, 200]
+        assert problem(answers[2], 409, "too_many_domains")["max_domains"] == 2
         assert client.delete("/v1/admin/domains/a").status_code == 204
         assert client.put("/v1/admin/domains/c", json=TAKES_ENCODINGS).status_code == 201
 
 
 def test_a_deleted_domain_is_gone_and_its_name_free(client, domain):
-    gone = client.delete(f"/v1/admin/domains/{domain}")
-    assert (gone.status_code, gone.content) == (204, b"")
+    answer = client.delete(f"/v1/admin/domains/{domain}")
+    assert (answer.status_code, answer.content) == (204, b"")
     assert client.post(f"/v1/domains/{domain}/localizations", json=RANKS).status_code == 404
     client.make_ready_domain(domain, closed=True)
     assert client.get(f"/v1/domains/{domain}").json()["closed"] is True
@@ -84,11 +84,11 @@ def shelf(client, request):
     """A domain's traverses, of which there is one, `t`."""
     base = f"/v1/admin/domains/{request.node.name.replace('_', '-')[:60]}"
     client.put(base, json=TAKES_ENCODINGS)
-    made = client.post(f"{base}/traverses", json={"name": "t"})
+    answer = client.post(f"{base}/traverses", json={"name": "t"})
     empty = dict.fromkeys(("length_m", "span_us", "digest", "grey_levels"))
     empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0, "n_spooled": 0}
     empty |= {"spooled_bytes": 0, "cameras": [], "warnings": []}
-    assert (made.status_code, made.json()) == (201, empty)
+    assert (answer.status_code, answer.json()) == (201, empty)
     return f"{base}/traverses"
 
 
@@ -111,8 +111,8 @@ def test_traverses_are_made_listed_and_deleted(client, shelf):
 def test_frames_twice_and_out_of_order(client, shelf):
     answers = []
     for index in (5, 0, 2, 5):
-        where = {"position_m": index, "timestamp_us": index, "x_m": 1, "y_m": 2}
-        answer = client.put(f"{shelf}/t/frames/{index}", params=where, json={"encoding": [float(index)] * DIM})
+        place = {"position_m": index, "timestamp_us": index, "x_m": 1, "y_m": 2}
+        answer = client.put(f"{shelf}/t/frames/{index}", params=place, json={"encoding": [float(index)] * DIM})
         answers.append((answer.status_code, answer.json()["index"], answer.json()["n_frames"]))
     assert answers == [(201, 5, 1), (201, 0, 2), (201, 2, 3), (200, 5, 3)]
     described = client.get(f"{shelf}/t").json()
@@ -136,36 +136,36 @@ def test_frames_twice_and_out_of_order(client, shelf):
 
 
 def test_what_is_there_stays_where_nothing_may_be_replaced(client, shelf):
-    there = {"encodings": np.eye(DIM)[:3], "index": np.arange(3), "position_m": np.arange(3.0)}
+    frames_there = {"encodings": np.eye(DIM)[:3], "index": np.arange(3), "position_m": np.arange(3.0)}
     frames = f"{shelf}/t/frames"
-    assert client.post(f"{frames}?replace=false", content=npz(**there), headers=NPZ).json()["n_new"] == 3
-    before = client.get(f"{shelf}/t").json()
+    assert client.post(f"{frames}?replace=false", content=npz(**frames_there), headers=NPZ).json()["n_new"] == 3
+    description = client.get(f"{shelf}/t").json()
 
-    again = client.post(f"{frames}?replace=false", content=npz(**there), headers=NPZ)
-    assert again.json() == {"n_new": 0, "n_replaced": 0, "n_frames": 3}
+    answer = client.post(f"{frames}?replace=false", content=npz(**frames_there), headers=NPZ)
+    assert answer.json() == {"n_new": 0, "n_replaced": 0, "n_frames": 3}
     encoding = {"encoding": np.eye(DIM)[1].tolist()}
     assert client.put(f"{frames}/1?position_m=1&replace=false", json=encoding).status_code == 200
-    for changed, indices, what in (
+    for changed, indices, difference in (
         ({"position_m": np.array([0.0, 5, 6])}, [1, 2], "position"),
         ({"x_m": np.array([np.nan, 1, np.nan])}, [1], "x"),
         ({"timestamp_us": np.array([-1, -1, 7])}, [2], "time"),
         ({"encodings": np.eye(DIM)[[3, 1, 2]]}, [0], "content"),
     ):
-        batch = npz(**{**there, "index": np.arange(3), **changed})
+        batch = npz(**{**frames_there, "index": np.arange(3), **changed})
         refused = problem(client.post(f"{frames}?replace=false", content=batch, headers=NPZ), 409, "frames_differ")
         assert (refused["indices"], refused["n_differing"]) == (indices, len(indices))
-        assert f"differ in {what}," in refused["detail"]
+        assert f"differ in {difference}," in refused["detail"]
     refused = client.put(f"{frames}/1?position_m=4&replace=false", json=encoding)
     assert problem(refused, 409, "frames_differ")["indices"] == [1]
-    assert client.get(f"{shelf}/t").json() == before
-    with np.load(BytesIO(client.get(frames).content)) as known:
-        assert {name: known[name].tolist() for name in ("index", "position_m", "timestamp_us")} == {
+    assert client.get(f"{shelf}/t").json() == description
+    with np.load(BytesIO(client.get(frames).content)) as columns:
+        assert {name: columns[name].tolist() for name in ("index", "position_m", "timestamp_us")} == {
             "index": [0, 1, 2],
             "position_m": [0, 1, 2],
             "timestamp_us": [-1] * 3,
         }
-        assert np.isnan([known["x_m"], known["y_m"]]).all()
-        assert known["content_digest"].tolist() == [
+        assert np.isnan([columns["x_m"], columns["y_m"]]).all()
+        assert columns["content_digest"].tolist() == [
             int.from_bytes(hashlib.blake2b(row.astype("<f4").tobytes(), digest_size=8).digest(), "little")
             for row in np.eye(DIM)[:3]
         ]
@@ -219,29 +219,29 @@ def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
     (warning,) = lying["warnings"]
     assert warning.startswith("its pictures are not like those of traverse upright: they lie on their side")
     client.put(f"{base}/traverses/upright/frames/8?position_m=8", content=view, headers=JPEG)
-    listed = client.get(f"{base}/traverses").json()["traverses"]
-    (mixed,) = (traverse["warnings"] for traverse in listed if traverse["name"] == "upright")
+    traverses = client.get(f"{base}/traverses").json()["traverses"]
+    (mixed,) = (traverse["warnings"] for traverse in traverses if traverse["name"] == "upright")
     assert len(mixed) == 1
     assert mixed[0].startswith(
         "some of its pictures are not like the others: they lie on their side: they are 120 x 160"
     )
-    alone = client.remap("cameras", training_traverse="upright", n_landmarks=8)
-    assert alone["result"]["metrics"]["warnings"] == []
-    lies = {"content": encoded(cv2.rotate(picture(1), cv2.ROTATE_90_CLOCKWISE)), "headers": JPEG}
+    job = client.remap("cameras", training_traverse="upright", n_landmarks=8)
+    assert job["result"]["metrics"]["warnings"] == []
+    lying_view = {"content": encoded(cv2.rotate(picture(1), cv2.ROTATE_90_CLOCKWISE)), "headers": JPEG}
     observations = f"/v1/sessions/{client.begin('cameras')['session_id']}/observations"
     for path in ("/v1/domains/cameras/localizations", observations):
-        (warning,) = client.post(path, **lies).json()["warnings"]
+        (warning,) = client.post(path, **lying_view).json()["warnings"]
         assert warning.startswith("the view's pixels are not like the map's: they lie on their side")
-    both = client.remap("cameras", training_traverse="upright", landmark_traverse="lying", n_landmarks=8)
-    (warning,) = both["result"]["metrics"]["warnings"]
+    job_of_both = client.remap("cameras", training_traverse="upright", landmark_traverse="lying", n_landmarks=8)
+    (warning,) = job_of_both["result"]["metrics"]["warnings"]
     assert warning.startswith(
         "the pictures of traverse lying are not like those of traverse upright: they lie on their"
     )
-    added = client.remap("cameras", training_traverse="lying", append=True, n_landmarks=8)
-    (warning,) = added["result"]["metrics"]["warnings"]
+    append_job = client.remap("cameras", training_traverse="lying", append=True, n_landmarks=8)
+    (warning,) = append_job["result"]["metrics"]["warnings"]
     assert warning.startswith("the pictures of traverse lying are not like those of the active map: they lie on their")
-    said = client.post("/v1/domains/cameras/localizations", **lies).json()["warnings"]
-    assert not any("pixels" in warning for warning in said), "such pictures are in the map by now"
+    warnings = client.post("/v1/domains/cameras/localizations", **lying_view).json()["warnings"]
+    assert not any("pixels" in warning for warning in warnings), "such pictures are in the map by now"
 
 
 # Jobs
@@ -282,7 +282,7 @@ def test_a_remap_is_followed_by_its_events(client, domain):
     assert jobs[0] in client.get("/v1/admin/jobs").json()["jobs"]
 
 
-class Held:
+class HoldingRunner:
     """Does jobs in this process; while it is held, none begins."""
 
     def __init__(self, data_dir):
@@ -297,12 +297,12 @@ class Held:
 
 
 @pytest.fixture
-def held(tmp_path):
-    held = Held(tmp_path)
-    with service(tmp_path, held, max_jobs=2) as client:
+def held_runner(tmp_path):
+    held_runner = HoldingRunner(tmp_path)
+    with service(tmp_path, held_runner, max_jobs=2) as client:
         client.make_ready_domain("ready")
-        yield client, held
-        held.free.set()
+        yield client, held_runner
+        held_runner.free.set()
 
 
 def ask(client, path, body, key=KEY, domain="ready"):
@@ -313,22 +313,22 @@ def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path):
     with service(tmp_path) as client:
         client.make_ready_domain("ready")
         first = ask(client, "remaps", REMAP)
-        done = client.wait_for(first.json()["job_id"])
-        assert (first.status_code, done["state"]) == (202, "succeeded")
+        first_job = client.wait_for(first.json()["job_id"])
+        assert (first.status_code, first_job["state"]) == (202, "succeeded")
     with service(tmp_path) as client:  # after a restart too
-        again = ask(client, "remaps", {**REMAP, "seed": 0, "landmark_traverse": None})  # the same, written out
-        assert (again.status_code, again.json()) == (202, done)
-        assert again.headers["location"] == first.headers["location"] == f"/v1/admin/jobs/{done['job_id']}"
+        repetition = ask(client, "remaps", {**REMAP, "seed": 0, "landmark_traverse": None})  # the same, written out
+        assert (repetition.status_code, repetition.json()) == (202, first_job)
+        assert repetition.headers["location"] == first.headers["location"] == f"/v1/admin/jobs/{first_job['job_id']}"
         assert len(client.get("/v1/admin/jobs").json()["jobs"]) == 2
         problem(ask(client, "remaps", {**REMAP, "seed": 1}), 422, "idempotency_key_reused")
         client.make_ready_domain("elsewhere")
-        others = [ask(client, "remaps", REMAP, key) for key in ({}, {}, {"Idempotency-Key": "another"})]
-        others.append(ask(client, "remaps", REMAP, domain="elsewhere"))
-        jobs = [client.wait_for(answer.json()["job_id"]) for answer in others]
-        assert len({done["job_id"], *(job["job_id"] for job in jobs)}) == 5
+        answers = [ask(client, "remaps", REMAP, key) for key in ({}, {}, {"Idempotency-Key": "another"})]
+        answers.append(ask(client, "remaps", REMAP, domain="elsewhere"))
+        jobs = [client.wait_for(answer.json()["job_id"]) for answer in answers]
+        assert len({first_job["job_id"], *(job["job_id"] for job in jobs)}) == 5
         assert jobs[-1]["domain"] == "elsewhere"
         client.delete("/v1/admin/domains/ready/traverses/drive")
-        assert ask(client, "remaps", REMAP).json() == done, "what was done needs its traverse no more"
+        assert ask(client, "remaps", REMAP).json() == first_job, "what was done needs its traverse no more"
         problem(ask(client, "remaps", REMAP, {}), 404, "unknown_traverse")
 
 
@@ -340,32 +340,32 @@ def test_experience_fed_back_twice_under_one_key_is_learnt_once(client, domain):
     truths = {"session_id": session["session_id"], "true_positions_m": [0.0, 4.0, None, 12.0]}
     first = ask(client, "experience", truths, domain=domain)
     assert first.status_code == 202, first.text
-    done = client.wait_for(first.json()["job_id"])
-    assert ask(client, "experience", truths, domain=domain).json() == done
+    first_job = client.wait_for(first.json()["job_id"])
+    assert ask(client, "experience", truths, domain=domain).json() == first_job
     other = {**truths, "true_positions_m": [0.0, 4.0, 8.0, 12.0]}
     problem(ask(client, "experience", other, domain=domain), 422, "idempotency_key_reused")
     job = client.wait_for(ask(client, "experience", other, {}, domain).json()["job_id"])
-    assert job["job_id"] != done["job_id"]
+    assert job["job_id"] != first_job["job_id"]
     assert client.wait_for(ask(client, "remaps", REMAP, domain=domain).json()["job_id"])["kind"] == "remap"
-    counted = f'deepsimbad_live_anr_percent_count{{domain="{domain}"}} 4.0'
-    assert counted in client.get("/metrics").text, "every truth counts once"
+    metric = f'deepsimbad_live_anr_percent_count{{domain="{domain}"}} 4.0'
+    assert metric in client.get("/metrics").text, "every truth counts once"
 
 
-def test_only_so_many_jobs_wait(held):
-    client, runner = held
+def test_only_so_many_jobs_wait(held_runner):
+    client, runner = held_runner
     runner.entered.clear()
     runner.free.clear()
     ask(client, "remaps", REMAP, {})
     assert runner.entered.wait(WITHIN_S)
-    waiting = [ask(client, "remaps", REMAP, key).json()["job_id"] for key in ({}, KEY)]
+    job_ids = [ask(client, "remaps", REMAP, key).json()["job_id"] for key in ({}, KEY)]
     full = ask(client, "remaps", REMAP, {})
-    about = problem(full, 429, "too_many_jobs")
-    assert (about["limit"], about["max_jobs"], full.headers["retry-after"]) == ("max_jobs", 2, "30")
-    assert ask(client, "remaps", REMAP).json()["job_id"] == waiting[1], "one that is known needs no room"
-    client.delete(f"/v1/admin/jobs/{waiting[0]}")
+    document = problem(full, 429, "too_many_jobs")
+    assert (document["limit"], document["max_jobs"], full.headers["retry-after"]) == ("max_jobs", 2, "30")
+    assert ask(client, "remaps", REMAP).json()["job_id"] == job_ids[1], "one that is known needs no room"
+    client.delete(f"/v1/admin/jobs/{job_ids[0]}")
     last = ask(client, "remaps", REMAP, {})
     assert last.status_code == 202, last.text
     runner.free.set()
     assert client.wait_for(last.json()["job_id"])["state"] == "succeeded"
-    assert client.wait_for(waiting[0])["state"] == "cancelled"
-    assert client.delete(f"/v1/admin/jobs/{waiting[0]}").status_code == 204, "it stays cancelled"
+    assert client.wait_for(job_ids[0])["state"] == "cancelled"
+    assert client.delete(f"/v1/admin/jobs/{job_ids[0]}").status_code == 204, "it stays cancelled"

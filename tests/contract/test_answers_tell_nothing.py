@@ -55,36 +55,36 @@ class Listener:
         return answer
 
     def walk(self, bodies=BODIES, queries=QUERIES):
-        """Every operation, with and without what it needs."""
+        """Ask every operation, with bodies and queries good and bad, and with names that exist or not."""
         for path, by_method in self.client.get("/openapi.json").json()["paths"].items():
             for method, operation in by_method.items():
-                tried = [(body, "") for body in (bodies if "requestBody" in operation else bodies[:1])]
-                tried += [(bodies[0], query) for query in queries]
-                for names, (body, query) in product((NAMES, dict.fromkeys(NAMES, "unknown")), tried):
+                requests = [(body, "") for body in (bodies if "requestBody" in operation else bodies[:1])]
+                requests += [(bodies[0], query) for query in queries]
+                for names, (body, query) in product((NAMES, dict.fromkeys(NAMES, "unknown")), requests):
                     if method != "delete" or names is not NAMES:
                         self.ask(method.upper(), f"{path.format(**names)}?{query}", *body)
             self.ask("PATCH", path.format(**NAMES))
 
 
 @pytest.fixture
-def ours(tmp_path):
+def listener(tmp_path):
     data_dir = tmp_path / "somewhere-secret"
     with service(data_dir) as client:
         client.make_ready_domain("ready")
         yield Listener(client, data_dir)
 
 
-def test_mistakes(ours):
-    ours.walk()
+def test_mistakes(listener):
+    listener.walk()
     for path in ("/no/such/path", "/v1", "/v1/", "/%00", "/docs/x", "/..%2f..%2fetc/passwd"):
-        ours.ask("GET", path)
-    assert ours.n_errors > 400
-    ours.client.services.catalog.close()
-    ours.client.services.session_store.close()
-    shutil.rmtree(ours.data_dir)
-    before = ours.n_errors
-    ours.walk(BODIES[:1], ())
-    assert ours.n_errors > before + 40
+        listener.ask("GET", path)
+    assert listener.n_errors > 400
+    listener.client.services.catalog.close()
+    listener.client.services.session_store.close()
+    shutil.rmtree(listener.data_dir)
+    n_before = listener.n_errors
+    listener.walk(BODIES[:1], ())
+    assert listener.n_errors > n_before + 40
 
 
 def damage(path):
@@ -99,11 +99,11 @@ def damage(path):
     "harm",
     [damage, Path.unlink, lambda path: (path.unlink(), path.mkdir()), lambda path: (path.unlink(), path.touch())],
 )
-def test_harmed_files(ours, harm):
-    session = ours.client.begin()["session_id"]
+def test_harmed_files(listener, harm):
+    session = listener.client.begin()["session_id"]
     admin = "/v1/admin/domains/ready"
-    assert ours.client.post(f"{admin}/traverses", json={"name": "other"}).status_code == 201
-    paths = [path for kind in ("traverses", "maps") for path in ours.data_dir.glob(f"domains/*/{kind}/*.sqlite")]
+    assert listener.client.post(f"{admin}/traverses", json={"name": "other"}).status_code == 201
+    paths = [path for kind in ("traverses", "maps") for path in listener.data_dir.glob(f"domains/*/{kind}/*.sqlite")]
     assert len(paths) == 3
     for path in paths:
         harm(path)
@@ -122,12 +122,12 @@ def test_harmed_files(ours, harm):
         ("POST", f"/v1/sessions/{session}/observations", b'{"ranked_landmarks": [1]}', JSON),
         ("POST", f"{admin}/remaps", b'{"training_traverse": "drive"}', JSON),
     ):
-        answer = ours.ask(method, url, body, headers)
+        answer = listener.ask(method, url, body, headers)
         if answer.status_code == 202:
-            job = f"/v1/admin/jobs/{ours.client.wait_for(answer.json()['job_id'])['job_id']}"
-            ours.ask("GET", job)
-            ours.ask("GET", f"{job}/events")
-    assert ours.n_errors >= 3
+            job = f"/v1/admin/jobs/{listener.client.wait_for(answer.json()['job_id'])['job_id']}"
+            listener.ask("GET", job)
+            listener.ask("GET", f"{job}/events")
+    assert listener.n_errors >= 3
 
 
 # Names in paths
@@ -173,19 +173,19 @@ async def code_of(app, method, url, body, content_type):
 
 @pytest.mark.parametrize("trick", TRICKS, ids=range(len(TRICKS)))
 def test_no_name_reaches_the_file_system(client, data_dir, trick):
-    """Every operation, with the trick as each of its names in turn, the others real."""
-    before = {path: path.stat().st_size for path in data_dir.rglob("*")}
-    asked = [
-        (method, path.format(**NAMES | {name: trick}), *sent)
-        for method, path, *sent in operations(client.app.openapi())
+    """Every operation is asked with the trick in the place of each of its names in turn, the other names real."""
+    sizes = {path: path.stat().st_size for path in data_dir.rglob("*")}
+    requests = [
+        (method, path.format(**NAMES | {name: trick}), *body)
+        for method, path, *body in operations(client.app.openapi())
         for name in re.findall(r"{(\w+)}", path)
         if not is_name(unquote(trick)) or name in {"index", "version"}
     ]
 
     async def codes():
-        return [await asyncio.wait_for(code_of(client.app, *request), 30) for request in asked]
+        return [await asyncio.wait_for(code_of(client.app, *request), 30) for request in requests]
 
-    for request, code in zip(asked, asyncio.run(codes()), strict=True):
+    for request, code in zip(requests, asyncio.run(codes()), strict=True):
         assert code in {"not_found", "method_not_allowed", "invalid_request"}, (request, code)
-    assert len(asked) > 1
-    assert {path: path.stat().st_size for path in data_dir.rglob("*")} == before
+    assert len(requests) > 1
+    assert {path: path.stat().st_size for path in data_dir.rglob("*")} == sizes

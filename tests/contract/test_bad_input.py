@@ -94,8 +94,8 @@ KNOWN = {"allowed": [*TAKEN["allowed"], "text/plain", "multipart/form-data"]}
 def test_bodies_that_are_no_view(client, views, of, body, content_type, status, code, hints):
     for path in views[of]:
         answer = client.post(path, content=body, headers={"Content-Type": content_type} if content_type else {})
-        told = problem(answer, status, code)
-        assert told == {**told, **hints}
+        document = problem(answer, status, code)
+        assert document == {**document, **hints}
 
 
 @pytest.mark.parametrize(
@@ -136,9 +136,11 @@ def test_bodies_that_are_no_view(client, views, of, body, content_type, status, 
 )
 def test_bad_json(client, views, body, code):
     for path in views["ready"]:
-        told = problem(ask(client, "POST", path, body), 422, code)
-        assert code != "invalid_request" or told["errors"][0]["loc"][0] == "body"
-        assert body != "{}" or told["detail"].startswith("body: give exactly one of ranked_landmarks, dissimilarities")
+        document = problem(ask(client, "POST", path, body), 422, code)
+        assert code != "invalid_request" or document["errors"][0]["loc"][0] == "body"
+        assert body != "{}" or document["detail"].startswith(
+            "body: give exactly one of ranked_landmarks, dissimilarities"
+        )
 
 
 def test_a_body_in_chunks_is_counted_as_it_comes(client):
@@ -245,7 +247,7 @@ STRANGE = {"unknown": "1"}
     ],
 )
 def test_members_that_cannot_be(client, method, path, base, wrong):
-    """JSON values by the member's name."""
+    """Every value in `wrong`, JSON texts by the name of a member, is refused in that member."""
     for member, values in wrong.items():
         for value in values.split():
             body = json.dumps(base)[:-1] + (", " if base else "") + f'"{member}": {value}}}'
@@ -275,8 +277,8 @@ def test_bad_priors(client, body):
 def test_bodies_of_other_types_are_no_frames(client):
     problem(client.put(FRAME, content=b"x", headers={"Content-Type": "text/plain"}), 415, "unsupported_media_type")
     problem(client.put(FRAME, content=encoded(picture(1)), headers=JPEG), 415, "unsupported_media_type")
-    seen = FRAME.replace("ready", "seen")
-    problem(client.put(seen, content=b"x", headers=JPEG), 422, "undecodable_image")
+    path = FRAME.replace("ready", "seen")
+    problem(client.put(path, content=b"x", headers=JPEG), 422, "undecodable_image")
     problem(client.post(FRAMES, content=b"", headers=NPZ), 422, "empty_body")
 
 
@@ -284,7 +286,7 @@ def test_bodies_of_other_types_are_no_frames(client):
 
 
 def test_whatever_is_asked_of_a_domain_session_or_job_that_nobody_knows(client):
-    """Each with a body that would be taken."""
+    """Every operation on such a name is a 404, with a body that would otherwise be accepted."""
     document = client.get("/openapi.json").json()
     n_asked = 0
     for method, path, body, content_type in operations(document):
@@ -328,8 +330,8 @@ NOWHERE = [
 
 @pytest.mark.parametrize(("method", "path", "body", "status", "code"), NOWHERE)
 def test_what_is_not_there(client, method, path, body, status, code):
-    told = problem(ask(client, method, path, body), status, code)
-    assert code != "no_active_map" or "remap" in told["detail"]
+    document = problem(ask(client, method, path, body), status, code)
+    assert code != "no_active_map" or "remap" in document["detail"]
 
 
 def test_a_method_that_a_path_does_not_know(client):
@@ -353,16 +355,16 @@ def test_an_unknown_word_is_answered_with_the_nearest_and_with_what_there_is(cli
     def detail(answer, status, code):
         return problem(answer, status, code)["detail"]
 
-    there = detail(client.get("/v1/domains/raedy"), 404, "unknown_domain")
-    assert "did you mean ready? There is " in there
+    sentence = detail(client.get("/v1/domains/raedy"), 404, "unknown_domain")
+    assert "did you mean ready? There is " in sentence
     assert "did you mean drive?" in detail(client.get(f"{ADMIN}/traverses/drvie"), 404, "unknown_traverse")
     sessions = f"{READY}/sessions"
     assert "did you mean informed?" in detail(client.post(sessions, json={"planner": "infromed"}), 422, "invalid_input")
     for body, nearest in (({"planer": "nnql"}, "planner"), ({"update": "mixtrue"}, "mixture")):
         assert f"did you mean {nearest}? There is " in detail(client.post(sessions, json=body), 422, "invalid_request")
     kinds = {"evaluator": {"kind": "featurel2"}}
-    made = client.put("/v1/admin/domains/mistyped", json=kinds)
-    assert "did you mean feature_l2?" in detail(made, 422, "invalid_input")
+    put_answer = client.put("/v1/admin/domains/mistyped", json=kinds)
+    assert "did you mean feature_l2?" in detail(put_answer, 422, "invalid_input")
 
 
 def test_a_query_parameter_that_a_call_does_not_take_is_refused_by_every_one(client):
@@ -370,8 +372,10 @@ def test_a_query_parameter_that_a_call_does_not_take_is_refused_by_every_one(cli
     for method, path, *_ in operations(document):
         refused = problem(client.request(method, f"{path.format(**NAMES)}&shortlis=3"), 422, "unknown_parameter")
         assert refused["unknown"] == ["shortlis"]
-        listed = document["paths"][path.partition("?")[0]][method.lower()].get("parameters", ())
-        assert sorted(refused["allowed"]) == sorted(each["name"] for each in listed if each["in"] == "query")
+        parameters = document["paths"][path.partition("?")[0]][method.lower()].get("parameters", ())
+        assert sorted(refused["allowed"]) == sorted(
+            parameter["name"] for parameter in parameters if parameter["in"] == "query"
+        )
         assert ("did you mean shortlist?" in refused["detail"]) == ("shortlist" in refused["allowed"])
     session = client.session()
     problem(client.post(f"{session}/observations?action_m=3&shortlis=3", json=RANKS), 422, "unknown_parameter")
@@ -393,7 +397,7 @@ def test_remaps_that_fail_leave_the_map_that_serves(client):
         assert job["state"] == "failed"
         assert job["error"]["code"] == code
     n_jobs = len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"])
-    for more, what in (  # what can be known before a job is made
+    for options, complaint in (  # what can be known before a job is made
         ({"training_traverse": "empty"}, "no frames yet"),
         ({"landmark_traverse": "empty"}, "no frames yet"),
         ({"check_traverse": "empty"}, "no frames yet"),
@@ -404,15 +408,15 @@ def test_remaps_that_fail_leave_the_map_that_serves(client):
         ({"training_traverse": "backwards", "relevance": "rrf"}, "the number of landmarks, 2"),
         ({"training_traverse": "backwards", "append": True, "list_length": 3}, "what is appended to it must be alike"),
     ):
-        refused = problem(client.post(f"{ADMIN}/remaps", json={**REMAP, **more}), 422, "invalid_map_config")
-        assert what in refused["detail"]
+        refused = problem(client.post(f"{ADMIN}/remaps", json={**REMAP, **options}), 422, "invalid_map_config")
+        assert complaint in refused["detail"]
     assert len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"]) == n_jobs
     too_many = {**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}
     assert problem(client.post(f"{ADMIN}/remaps", json=too_many), 422, "too_few_candidates")["n_candidates"] == N_READY
     assert client.get(READY).json()["map_version"] == 1
     client.post("/v1/admin/domains/unmapped/traverses", json={"name": "drive"})
-    appended = client.post("/v1/admin/domains/unmapped/remaps", json={**REMAP, "append": True})
-    assert "make one first, without append" in problem(appended, 409, "no_active_map")["detail"]
+    answer = client.post("/v1/admin/domains/unmapped/remaps", json={**REMAP, "append": True})
+    assert "make one first, without append" in problem(answer, 409, "no_active_map")["detail"]
 
 
 def test_a_damaged_map(client, domain, data_dir):
@@ -438,8 +442,12 @@ def test_a_damaged_map(client, domain, data_dir):
         assert int(answer.headers["retry-after"]) > 0
         assert str(data_dir) not in answer.text
         problem(client.get(f"/v1/domains/{domain}/landmark-model"), 503, "damaged_map")
-    told = client.get(f"/v1/domains/{domain}").json()
-    assert (told["map_version"], told["map_problem"], told["n_map_images"]) == (2, "damaged_map", None)
+    description = client.get(f"/v1/domains/{domain}").json()
+    assert (description["map_version"], description["map_problem"], description["n_map_images"]) == (
+        2,
+        "damaged_map",
+        None,
+    )
     assert client.put(active, json={"version": 1, "expected": 2}).status_code == 200
     assert client.post(place, json=RANKS).status_code == 200
 
@@ -468,12 +476,12 @@ def season(seed, n_frames=PLACES):
 
 
 @pytest.fixture
-def mapped(client, request):
-    """The job that maps drives, and a function that tells where a view is placed."""
+def map_drives(client, request):
+    """A function that maps drives; it returns the job, and a function that localizes a view."""
     name = f"drives-{zlib.crc32(request.node.name.encode())}"
     assert client.put(f"/v1/admin/domains/{name}", json={"evaluator": {**KIND, "extractor": "none"}}).is_success
 
-    def mapped(summer, winter=None, plane=(None, None), **remap):
+    def map_drives(summer, winter=None, plane=(None, None), **remap):
         for traverse, encodings, at_m in (("summer", summer, plane[0]), ("winter", winter, plane[1])):
             if encodings is not None:
                 x_m = {} if at_m is None else {"x_m": at_m, "y_m": np.zeros(len(at_m))}
@@ -484,17 +492,17 @@ def mapped(client, request):
             f"/v1/domains/{name}/localizations", json={"encoding": view.astype(float).tolist()}
         ).json()
 
-    yield mapped
+    yield map_drives
     assert client.delete(f"/v1/admin/domains/{name}").status_code == 204
 
 
 @pytest.mark.parametrize("still", ["summer", "winter", "both"])
-def test_a_number_that_stands_still_in_a_season_says_nothing(mapped, still):
+def test_a_number_that_stands_still_in_a_season_says_nothing(map_drives, still):
     summer, winter, live = season(1), season(2), season(3)
     for drive, names in ((summer, ("summer", "both")), (winter, ("winter", "both"))):
         if still in names:
             drive[:, 3] = 700 if drive is winter else -3
-    job, place = mapped(summer, winter, same_route=True)
+    job, place = map_drives(summer, winter, same_route=True)
     assert job["state"] == "succeeded", job["error"]
     assert job["result"]["metrics"]["second_season"]["accepted"] is True
     for value in (-3, 0, 700):
@@ -512,25 +520,25 @@ def test_fewer_frames_than_a_list_takes_are_refused_at_once(client, n_frames):
     assert client.delete(base).status_code == 204
 
 
-def test_a_short_drive_is_mapped_by_landmarks_of_a_longer_one(mapped):
-    job, place = mapped(season(1)[:3], season(2), n_landmarks=100)
+def test_a_short_drive_is_mapped_by_landmarks_of_a_longer_one(map_drives):
+    job, place = map_drives(season(1)[:3], season(2), n_landmarks=100)
     assert job["state"] == "succeeded", job["error"]
     assert place(season(3)[1])["belief"]["mode_m"] == 1
 
 
 @pytest.mark.parametrize("plane", [False, True])
-def test_a_drive_the_other_way_teaches_no_second_season(mapped, plane):
+def test_a_drive_the_other_way_teaches_no_second_season(map_drives, plane):
     planes = (AT_M, AT_M[::-1].copy()) if plane else (None, None)
-    job, place = mapped(season(1), season(2)[::-1], planes, same_route=None if plane else True)
+    job, place = map_drives(season(1), season(2)[::-1], planes, same_route=None if plane else True)
     verdict = job["result"]["metrics"]["second_season"]
     says = "share 0 places" if plane else "agree no better than where one is shifted"
     assert (verdict["accepted"], says in verdict["why"]) == (False, True)
     assert place(season(3)[30])["belief"]["mode_m"] == 30
 
 
-def test_a_drive_of_another_extractor_is_named_or_teaches_nothing(mapped, client):
+def test_a_drive_of_another_extractor_is_named_or_teaches_nothing(map_drives, client):
     other = np.random.default_rng(9).normal(size=(PLACES, DIM)).astype(np.float32)
-    job, _ = mapped(season(1), other, same_route=True)
+    job, _ = map_drives(season(1), other, same_route=True)
     verdict = job["result"]["metrics"]["second_season"]
     assert (verdict["accepted"], "agree no better" in verdict["why"]) == (False, True)
     client.upload(job["domain"], "short", other[:, :5], AT_M)
@@ -541,16 +549,16 @@ def test_a_drive_of_another_extractor_is_named_or_teaches_nothing(mapped, client
 
 @pytest.mark.parametrize("covered", ["summer", "winter"])
 @pytest.mark.parametrize("relevance", ["composed", "rrf"])
-def test_a_drive_that_shows_one_picture_alone_is_named(mapped, covered, relevance):
+def test_a_drive_that_shows_one_picture_alone_is_named(map_drives, covered, relevance):
     drives = {"summer": season(1), "winter": season(2)}
     drives[covered][:] = drives[covered][0]
-    job, _ = mapped(**drives, relevance=relevance)
+    job, _ = map_drives(**drives, relevance=relevance)
     assert (job["state"], job["error"]["code"]) == ("failed", "invalid_encoding")
     assert f"all {PLACES} frames of traverse {covered} have one and the same encoding" in job["error"]["detail"]
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
-def test_encodings_of_any_size_are_compared(mapped, scale):
-    job, place = mapped(season(1) * np.float32(scale))
+def test_encodings_of_any_size_are_compared(map_drives, scale):
+    job, place = map_drives(season(1) * np.float32(scale))
     assert job["state"] == "succeeded", job["error"]
     assert place(season(3)[30] * np.float32(scale))["belief"]["mode_m"] == 30

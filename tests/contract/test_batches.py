@@ -25,9 +25,9 @@ def zipped(members):
     return packed.getvalue()
 
 
-def npy(array, **how):
+def npy(array, **options):
     packed = io.BytesIO()
-    np.lib.format.write_array(packed, array, **how)
+    np.lib.format.write_array(packed, array, **options)
     return packed.getvalue()
 
 
@@ -88,9 +88,9 @@ BATCHES = [
 
 @pytest.mark.parametrize(("body", "code"), BATCHES, ids=range(len(BATCHES)))
 def test_bad_batches(client, body, code):
-    before = client.get(TRAVERSE).json()
+    description = client.get(TRAVERSE).json()
     problem(client.post(FRAMES, content=body, headers=NPZ), 422, code)
-    assert client.get(TRAVERSE).json() == before
+    assert client.get(TRAVERSE).json() == description
 
 
 def test_batches_that_are_too_much(client):
@@ -119,14 +119,14 @@ def test_round_trip(save):
 
 
 def test_every_cut_of_a_batch_is_refused_and_any_flipped_byte_is_or_is_harmless():
-    whole = npz(**GOOD)
-    for length in range(0, len(whole), 7):
+    batch = npz(**GOOD)
+    for length in range(0, len(batch), 7):
         with pytest.raises(InvalidBatchError):
-            read_batch(io.BytesIO(whole[:length]), 10_000)
+            read_batch(io.BytesIO(batch[:length]), 10_000)
     rng = np.random.default_rng(0)
     n_refused = 0
-    for place in rng.choice(len(whole), 300):
-        broken = bytearray(whole)
+    for place in rng.choice(len(batch), 300):
+        broken = bytearray(batch)
         broken[place] ^= 1 << int(rng.integers(8))
         try:
             read_batch(io.BytesIO(bytes(broken)), 10_000)

@@ -43,11 +43,11 @@ def test_every_answer_carries_them_once(client, method, path, status, monkeypatc
 
 
 def test_the_root_says_where_to_go(client):
-    told = client.get("/").json()
-    assert client.get(f"/{told['documentation']}").status_code == client.get(f"/{told['domains']}").status_code == 200
+    links = client.get("/").json()
+    assert client.get(f"/{links['documentation']}").status_code == client.get(f"/{links['domains']}").status_code == 200
     page = client.get("/", headers={"Accept": "text/html,*/*;q=0.8"})
     assert page.headers["content-type"].startswith("text/html")
-    assert set(re.findall(r'href="([^"]+)"', page.text)) == set(told.values()) - {told["name"], told["version"]}
+    assert set(re.findall(r'href="([^"]+)"', page.text)) == set(links.values()) - {links["name"], links["version"]}
 
 
 def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client):
@@ -77,7 +77,7 @@ def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client):
 
 
 @pytest.fixture
-def crossed(tmp_path):
+def cors_client(tmp_path):
     """A service that lets one origin in, asked by a page of it; the header with a key."""
     with Catalog.open(tmp_path) as catalog:
         _, key = catalog.create_key(KeyScope.ADMIN)
@@ -87,11 +87,14 @@ def crossed(tmp_path):
 
 
 def preflight(client, origin):
-    asked = {"Access-Control-Request-Method": "PUT", "Access-Control-Request-Headers": "authorization,content-type"}
-    return client.options("/v1/admin/domains/a", headers={"Origin": origin, **asked})
+    request_headers = {
+        "Access-Control-Request-Method": "PUT",
+        "Access-Control-Request-Headers": "authorization,content-type",
+    }
+    return client.options("/v1/admin/domains/a", headers={"Origin": origin, **request_headers})
 
 
-def listed(answer, header):
+def values_of(answer, header):
     return set(re.split(r",\s*", answer.headers[header].lower()))
 
 
@@ -101,24 +104,24 @@ def test_without_the_setting_no_origin_is_let_in(client):
         assert not [name for name in answer.headers if name.startswith("access-control")]
 
 
-def test_a_preflight_needs_no_key_and_the_call_itself_does(crossed):
-    client, key = crossed
+def test_a_preflight_needs_no_key_and_the_call_itself_does(cors_client):
+    client, key = cors_client
     answer = preflight(client, ORIGIN)
     assert answer.status_code == 200
-    assert "put" in listed(answer, "access-control-allow-methods")
-    taken = {"authorization", "x-api-key", "content-type", "idempotency-key"}
-    assert taken <= listed(answer, "access-control-allow-headers")
+    assert "put" in values_of(answer, "access-control-allow-methods")
+    header_names = {"authorization", "x-api-key", "content-type", "idempotency-key"}
+    assert header_names <= values_of(answer, "access-control-allow-headers")
     assert "access-control-allow-credentials" not in answer.headers
     assert EVERYWHERE.items() <= dict(answer.headers).items()
     refused, let_in = client.get("/v1/domains"), client.get("/v1/domains", headers=key)
     assert (refused.status_code, let_in.status_code) == (401, 200)
-    for each in (answer, refused, let_in):  # or the page could not read why
-        assert each.headers["access-control-allow-origin"] == ORIGIN
-    assert {"x-request-id", "retry-after", "location"} <= listed(let_in, "access-control-expose-headers")
+    for response in (answer, refused, let_in):  # or the page could not read why
+        assert response.headers["access-control-allow-origin"] == ORIGIN
+    assert {"x-request-id", "retry-after", "location"} <= values_of(let_in, "access-control-expose-headers")
 
 
-def test_another_origin_is_not_let_in(crossed):
-    client, _ = crossed
+def test_another_origin_is_not_let_in(cors_client):
+    client, _ = cors_client
     for origin in ("https://evil.example.org", f"{ORIGIN}.evil.org", "null", ORIGIN.upper(), ORIGIN.replace("s:", ":")):
         assert preflight(client, origin).status_code == 400
         assert "access-control-allow-origin" not in client.get("/healthz", headers={"Origin": origin}).headers

@@ -21,11 +21,11 @@ def test_the_page_and_all_it_names_come_from_here_under_a_strict_policy(client):
     policy = dict(part.split(" ", 1) for part in page.headers["content-security-policy"].split("; "))
     assert policy["default-src"] == policy["frame-ancestors"] == "'none'"
     assert policy["script-src"] == policy["style-src"] == policy["connect-src"] == "'self'"
-    named = set(re.findall(r'(?:href|src)="console/([^"]+)"', page.text))
+    names = set(re.findall(r'(?:href|src)="console/([^"]+)"', page.text))
     for script in FILES.glob("*.js"):
-        named |= set(re.findall(r'from "\./([^"]+)"', script.read_text()))
-    assert {"main.js", "console.css", "uplot.js", "preact.js", "sessions.js"} <= named
-    for name in sorted(named):
+        names |= set(re.findall(r'from "\./([^"]+)"', script.read_text()))
+    assert {"main.js", "console.css", "uplot.js", "preact.js", "sessions.js"} <= names
+    for name in sorted(names):
         answer = client.get(f"/console/{name}")
         assert answer.status_code == 200, name
         assert re.match(r"text/(javascript|css)|image/svg", answer.headers["content-type"]), name
@@ -53,7 +53,7 @@ def test_a_report_is_shown_where_it_reaches_neither_the_key_nor_a_host(client):
 
 def events(client, path, **options):
     """The events of a session until it has ended: (name, id, document)."""
-    told, current = [], {}
+    rows, current = [], {}
     with client.stream("GET", f"{path}/events", **options) as stream:
         assert stream.status_code == 200, stream.read()
         for line in stream.iter_lines():
@@ -61,9 +61,9 @@ def events(client, path, **options):
             if line:
                 current[field] = content
             elif "data" in current:
-                told.append((current["event"], current.get("id"), json.loads(current["data"])))
+                rows.append((current["event"], current.get("id"), json.loads(current["data"])))
                 current = {}
-    return told
+    return rows
 
 
 def test_a_sessions_events_are_what_its_observations_were_answered(client):
@@ -72,19 +72,19 @@ def test_a_sessions_events_are_what_its_observations_were_answered(client):
     answers = [client.post(f"{path}/observations?action_m=2", json=RANKS).json() for _ in range(3)]
     prior = client.put(f"{path}/prior", json={"position_m": 10.0, "std_m": 2.0}).json()
     assert client.delete(path).status_code == 204
-    told = events(client, path, params={"after": 0})
-    assert [(name, number) for name, number, _ in told] == [
+    rows = events(client, path, params={"after": 0})
+    assert [(name, number) for name, number, _ in rows] == [
         *(("observation", str(n)) for n in (1, 2, 3)),
         ("prior", "4"),
         ("done", None),
     ]
-    for answer, (_, _, event) in zip([*answers, prior], told, strict=False):
+    for answer, (_, _, event) in zip([*answers, prior], rows, strict=False):
         for document in (answer, event):
             document.pop("timings_ms", None)
         assert answer == event
-    later = events(client, path, headers={"Last-Event-ID": "2"})
-    assert [number for _, number, _ in later] == ["3", "4", None]
-    assert later[0][2]["belief"] == told[2][2]["belief"]
+    later_rows = events(client, path, headers={"Last-Event-ID": "2"})
+    assert [number for _, number, _ in later_rows] == ["3", "4", None]
+    assert later_rows[0][2]["belief"] == rows[2][2]["belief"]
     assert [number for _, number, _ in events(client, path)] == ["4", None], "the last one, where nobody said from when"
 
 
@@ -138,9 +138,9 @@ def test_coverage_names_every_map_image_and_the_worst_stretches(client):
     worst = [stretch["chance"] for stretch in answer["stretches"]]
     assert worst == sorted(worst)
     for stretch in answer["stretches"]:
-        some = chance[stretch["first_map_image"] : stretch["last_map_image"] + 1]
-        assert stretch["chance"] == pytest.approx(some.mean(), abs=1e-3)
-        assert some.mean() < chance.mean()
+        chances = chance[stretch["first_map_image"] : stretch["last_map_image"] + 1]
+        assert stretch["chance"] == pytest.approx(chances.mean(), abs=1e-3)
+        assert chances.mean() < chance.mean()
     problem(client.get("/v1/domains/unmapped/coverage"), 409, "no_active_map")
     problem(client.get("/v1/domains/ready/coverage?map_version=99"), 404, "unknown_map_version")
 

@@ -20,7 +20,7 @@ REMAP |= {"n_landmarks": 16, "training_episodes": 0}
 
 
 def street(season):
-    """N views along a painted street, a window that moves on; another season is other light, and grain."""
+    """N views along a painted street, through a window that moves on; a season changes the light and the grain."""
     rng, light = np.random.default_rng(7), np.random.default_rng(season)
     street = cv2.resize(rng.integers(0, 255, (8, 120, 3), np.uint8), (N * 16 + 128, 96), interpolation=cv2.INTER_CUBIC)
     lit = 255 * (street / 255) ** (1 + 0.5 * season)
@@ -31,7 +31,7 @@ def street(season):
 
 
 def drive(client, domain, name, season, n=N):
-    """Upload a drive of pictures; the answers."""
+    """Upload the first `n` pictures of a drive; the answers to the uploads."""
     client.post(f"/v1/admin/domains/{domain}/traverses", json={"name": name})
     frames = f"/v1/admin/domains/{domain}/traverses/{name}/frames"
     return [
@@ -40,7 +40,7 @@ def drive(client, domain, name, season, n=N):
     ]
 
 
-def waiting(client, domain, name):
+def n_waiting(client, domain, name):
     traverse = client.get(f"/v1/admin/domains/{domain}/traverses/{name}").json()
     return traverse["n_spooled"], traverse["spooled_bytes"]
 
@@ -56,10 +56,10 @@ def make(client, domain, evaluator=SIAMESE):
 def test_images_wait_are_fitted_and_deleted_and_the_map_answers_every_kind_of_view(client, tmp_path, kind):
     domain, views = f"fitted-{kind}", street(2)
     make(client, domain, {**SIAMESE, "kind": kind})
-    assert waiting(client, domain, "first") == (N, sum(len(encoded(picture, ".png")) for picture in street(0)))
+    assert n_waiting(client, domain, "first") == (N, sum(len(encoded(picture, ".png")) for picture in street(0)))
     job = client.remap(domain, **REMAP)
     assert job["state"] == "succeeded", job
-    assert [waiting(client, domain, name) for name in ("first", "second")] == [(0, 0)] * 2
+    assert [n_waiting(client, domain, name) for name in ("first", "second")] == [(0, 0)] * 2
     metrics = job["result"]["metrics"]
     fitting = metrics["fitting"]
     assert (fitting["n_views"], fitting["n_shared_places"], fitting["seed"]) == (128, N, 0)
@@ -71,26 +71,27 @@ def test_images_wait_are_fitted_and_deleted_and_the_map_answers_every_kind_of_vi
     assert not [warning for warning in metrics["warnings"] if warning.startswith("fitted_without_images")]
 
     localizations = f"/v1/domains/{domain}/localizations"
-    own, best = client.get(f"/v1/domains/{domain}/landmark-model").content, []
-    encoder = OnBoardEncoder(own)
+    model, map_images = client.get(f"/v1/domains/{domain}/landmark-model").content, []
+    encoder = OnBoardEncoder(model)
     session = client.session(domain)
     for at, picture in list(enumerate(views))[::3]:
         answer = client.post(localizations, content=encoded(picture, ".png"), headers=PNG)
-        best.append(answer.json()["retrieval"][0]["map_image"])
+        map_images.append(answer.json()["retrieval"][0]["map_image"])
         ranks = encoder.ranks(picture, m=16)
-        sent = client.post(localizations, content=ranks.body, headers=ranks.headers)
-        assert sent.status_code == 200, sent.text
+        response = client.post(localizations, content=ranks.body, headers=ranks.headers)
+        assert response.status_code == 200, response.text
         step = f"{session}/observations?action_m={min(at, 3)}"
         belief = client.post(step, content=encoded(picture, ".png"), headers=PNG).json()["belief"]
-    assert np.mean(np.abs(np.array(best) - np.arange(0, N, 3)) <= 2) > 0.8
+    assert np.mean(np.abs(np.array(map_images) - np.arange(0, N, 3)) <= 2) > 0.8
     assert abs(belief["mode_m"] - (N - 1)) <= 2
 
-    later = client.remap(domain, training_traverse="first", training_episodes=0)  # landmarks, and what was fitted, stay
-    assert later["state"] == "succeeded", later
-    assert "fitting" not in later["result"]["metrics"]
+    # Landmarks, and what was fitted, stay
+    retraining = client.remap(domain, training_traverse="first", training_episodes=0)
+    assert retraining["state"] == "succeeded", retraining
+    assert "fitting" not in retraining["result"]["metrics"]
     assert drive(client, domain, "third", 2)[-1].status_code == 201
-    appended = client.remap(domain, training_traverse="third", append=True, same_route=True)
-    assert appended["result"]["metrics"]["fused"]["accepted"], appended
+    append_job = client.remap(domain, training_traverse="third", append=True, same_route=True)
+    assert append_job["result"]["metrics"]["fused"]["accepted"], append_job
 
 
 @of_one_process
@@ -100,18 +101,23 @@ def test_views_that_were_kept_serve_the_next_fit_and_without_any_it_says_so(clie
     encoded_images = []
     encode = FeatureL2.encode
     monkeypatch.setattr(FeatureL2, "encode", lambda self, images: encoded_images.extend(images) or encode(self, images))
-    first = client.remap("kept", **REMAP)
+    first_job = client.remap("kept", **REMAP)
     assert len(encoded_images) == 128
-    again = client.remap("kept", **{**REMAP, "n_landmarks": 12, "relevance": "rrf"})
-    assert again["state"] == "succeeded", again
+    next_job = client.remap("kept", **{**REMAP, "n_landmarks": 12, "relevance": "rrf"})
+    assert next_job["state"] == "succeeded", next_job
     assert len(encoded_images) == 128, "the twelve are among the sixteen"
-    other = client.remap("kept", **{**REMAP, "landmark_traverse": "second", "training_traverse": "first"})
-    (warning,) = [said for said in other["result"]["metrics"]["warnings"] if said.startswith("fitted_without_images: ")]
+    other_job = client.remap("kept", **{**REMAP, "landmark_traverse": "second", "training_traverse": "first"})
+    (warning,) = [
+        text for text in other_job["result"]["metrics"]["warnings"] if text.startswith("fitted_without_images: ")
+    ]
     assert "16 of 16 landmarks" in warning
-    assert other["result"]["metrics"]["fitting"]["n_views"] == 0
-    same = client.remap("kept", **REMAP)
+    assert other_job["result"]["metrics"]["fitting"]["n_views"] == 0
+    repeated_job = client.remap("kept", **REMAP)
     path = "/v1/domains/kept/landmark-model?map_version="
-    etags = [client.get(f"{path}{job['result']['map_version']}").headers["etag"] for job in (first, same, other)]
+    etags = [
+        client.get(f"{path}{job['result']['map_version']}").headers["etag"]
+        for job in (first_job, repeated_job, other_job)
+    ]
     assert etags[0] == etags[1] != etags[2]
 
 
@@ -125,7 +131,7 @@ def test_a_full_spool_refuses_the_frame_and_loses_nothing(tmp_path):
         document = problem(answers[-1], 409, "spool_full")
         assert document["limit"] == "max_spool_bytes"
         assert "first" in document["detail"]
-        assert waiting(client, "small", "first")[0] == n_taken
+        assert n_waiting(client, "small", "first")[0] == n_taken
         assert client.remap("small", training_traverse="first", training_episodes=0)["state"] == "succeeded"
         assert {answer.status_code for answer in drive(client, "small", "second", 1, n_taken)} == {201}
         replaced = drive(client, "small", "first", 0, 1)[0]
@@ -136,11 +142,11 @@ def test_a_full_spool_refuses_the_frame_and_loses_nothing(tmp_path):
 
 def test_a_fit_that_is_cancelled_or_cannot_be_leaves_the_spool(tmp_path, monkeypatch):
     monkeypatch.setattr("deepsimbad.jobs.progress._INTERVAL_S", 0.0)  # every share is told, however fast the fit is
-    seen = []
+    states = []
 
     def run_job(job, on_progress, is_cancelled):
         def look(state):
-            seen.append(state)
+            states.append(state)
             on_progress(state)
             if cancels and state.stage == "fit" and state.progress > cancels[0]:
                 client.delete(f"/v1/admin/jobs/{job.job_id}")
@@ -152,16 +158,16 @@ def test_a_fit_that_is_cancelled_or_cannot_be_leaves_the_spool(tmp_path, monkeyp
         make(client, "stopped")
         while cancels:
             assert client.remap("stopped", **REMAP)["state"] == "cancelled"
-            assert [waiting(client, "stopped", name)[0] for name in ("first", "second")] == [N, N]
+            assert [n_waiting(client, "stopped", name)[0] for name in ("first", "second")] == [N, N]
             cancels.pop(0)
         with sqlite3.connect(tmp_path / "domains/stopped/traverses/first.sqlite") as db:
             assert db.execute("SELECT count(*) FROM view_encoding").fetchone()[0] > 0, "what is done need not be again"
-        few = client.remap("stopped", **{**REMAP, "n_landmarks": 1, "list_length": 1})
-        assert few["error"]["code"] == "too_few_to_fit"
-        assert waiting(client, "stopped", "first")[0] == N
-        done = client.remap("stopped", **REMAP)
-        assert done["state"] == "succeeded", done
-        assert [state.stage for state in seen if state.eta_s is not None and state.stage == "fit"]
+        failed_job = client.remap("stopped", **{**REMAP, "n_landmarks": 1, "list_length": 1})
+        assert failed_job["error"]["code"] == "too_few_to_fit"
+        assert n_waiting(client, "stopped", "first")[0] == N
+        last_job = client.remap("stopped", **REMAP)
+        assert last_job["state"] == "succeeded", last_job
+        assert [state.stage for state in states if state.eta_s is not None and state.stage == "fit"]
 
 
 def test_a_frame_that_is_replaced_takes_what_waited_with_it(client):
@@ -169,10 +175,10 @@ def test_a_frame_that_is_replaced_takes_what_waited_with_it(client):
     drive(client, "replaced", "first", 0, 3)
     frames = "/v1/admin/domains/replaced/traverses/first/frames"
     assert drive(client, "replaced", "first", 1, 1)[0].status_code == 200
-    assert waiting(client, "replaced", "first")[0] == 3
+    assert n_waiting(client, "replaced", "first")[0] == 3
     ready = np.ones(FeatureL2("gradient_grid").encoding_dim or 0).tolist()
     client.put(f"{frames}/0?position_m=0", json={"encoding": ready})
-    assert waiting(client, "replaced", "first")[0] == 2
+    assert n_waiting(client, "replaced", "first")[0] == 2
     client.put("/v1/admin/domains/plain", json={"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}})
     drive(client, "plain", "first", 0, 2)
-    assert waiting(client, "plain", "first") == (0, 0), "images of an evaluator that is not fitted do not wait"
+    assert n_waiting(client, "plain", "first") == (0, 0), "images of an evaluator that is not fitted do not wait"

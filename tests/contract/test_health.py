@@ -51,9 +51,9 @@ def test_a_service_is_shown_below_a_path(tmp_path):
         assert client.get("/openapi.json").json()["servers"] == [{"url": "/robots/simbad"}]
         for given_on in ("", "/robots/simbad"):  # by proxies that take it away, and those that do not
             assert client.get(f"{given_on}/v1/domains/below").status_code == 200
-            begun = client.post(f"{given_on}/v1/domains/below/sessions", json={})
-            assert begun.headers["location"] == f"/robots/simbad/v1/sessions/{begun.json()['session_id']}"
-            assert client.get(begun.headers["location"]).status_code == 200
+            answer = client.post(f"{given_on}/v1/domains/below/sessions", json={})
+            assert answer.headers["location"] == f"/robots/simbad/v1/sessions/{answer.json()['session_id']}"
+            assert client.get(answer.headers["location"]).status_code == 200
         job = client.post("/v1/admin/domains/below/remaps", json={"training_traverse": "drive"})
         assert job.headers["location"] == f"/robots/simbad/v1/admin/jobs/{job.json()['job_id']}"
         assert client.get("/robots/simbadly/v1/domains").status_code == 404
@@ -63,15 +63,15 @@ def test_a_service_is_shown_below_a_path(tmp_path):
 
 
 def test_not_ready_while_stopping(tmp_path):
-    before = set(threading.enumerate())
+    threads = set(threading.enumerate())
     with service(tmp_path) as client:
         client.services.stopping.set()
         answer = client.get("/readyz")
         problem(answer, 503, "unavailable")
         assert answer.headers["retry-after"]
         assert client.get("/healthz").status_code == 200
-    left = {thread.name for thread in set(threading.enumerate()) - before}
-    assert not {"inference", "jobs"} & left
+    left_names = {thread.name for thread in set(threading.enumerate()) - threads}
+    assert not {"inference", "jobs"} & left_names
 
 
 @pytest.fixture
@@ -83,17 +83,17 @@ def breakable(one_process, tmp_path, monkeypatch):
 
 def faults(client):
     answer = client.get("/readyz")
-    shown = re.search(r"^deepsimbad_ready (\S+)$", client.get("/metrics").text, re.MULTILINE)
-    assert shown is not None
-    assert float(shown[1]) == (answer.status_code == 200)
+    gauge = re.search(r"^deepsimbad_ready (\S+)$", client.get("/metrics").text, re.MULTILINE)
+    assert gauge is not None
+    assert float(gauge[1]) == (answer.status_code == 200)
     assert client.get("/healthz").status_code == 200, "whatever is wrong, the process lives"
     if answer.status_code == 200:
         return []
-    about = problem(answer, 503, "unavailable")
+    document = problem(answer, 503, "unavailable")
     assert answer.headers["retry-after"]
-    assert about["detail"] == "; ".join(about["faults"])
+    assert document["detail"] == "; ".join(document["faults"])
     assert str(client.services.settings.data_dir) not in answer.text
-    return list(about["faults"])
+    return list(document["faults"])
 
 
 def refuse_writes(client, is_on=True):
@@ -143,7 +143,7 @@ def test_a_disk_almost_full_or_read_only(breakable, monkeypatch):
 
 
 def test_whoever_asks_often_is_answered_from_memory(breakable, monkeypatch):
-    """Or a stranger could keep the disk busy."""
+    """Else a stranger could keep the disk busy."""
     refuse_writes(breakable)
     assert len(faults(breakable)) == 1
     refuse_writes(breakable, False)

@@ -1,4 +1,4 @@
-"""What an attacker sends, to a real process: each refused by name, at no cost to the robot beside it."""
+"""What an attacker sends to a real process is refused by name, at no cost to the robot beside it."""
 
 import contextlib
 import gzip
@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from .conftest import Caller, until
-from .served import Robot, Served
+from .conftest import Caller, wait_until
+from .server_process import Robot, ServerProcess
 
 pytestmark = pytest.mark.slow
 
@@ -34,49 +34,49 @@ VIEW = b'{"ranked_landmarks": [1, 2]}'
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory):
+def server(tmp_path_factory):
     limits = {
         "max_connections": MAX_CONNECTIONS,
         "max_requests": MAX_REQUESTS,
         "max_batch_bytes": 64 * MEBIBYTE,
         "max_body_memory_bytes": MAX_BODY_MEMORY,
     }
-    with Served(tmp_path_factory.mktemp("hostile") / "data", **limits) as served:
-        with Caller(base_url=served.url, timeout=60) as client:
+    with ServerProcess(tmp_path_factory.mktemp("hostile") / "data", **limits) as server:
+        with Caller(base_url=server.url, timeout=60) as client:
             client.make_ready_domain("ready")
             client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}})
             client.post("/v1/admin/domains/seen/traverses", json={"name": "t"})
-        yield served
-        assert b"Traceback" not in served.log_path.read_bytes()
+        yield server
+        assert b"Traceback" not in server.log_path.read_bytes()
 
 
 @pytest.fixture(scope="module")
-def robot(served):
-    robot = Robot(served)
+def robot(server):
+    robot = Robot(server)
     thread = threading.Thread(target=robot.drive)
     thread.start()
     robot.answered_more(100)
-    before = served.mib()
+    before_mib = server.mib()
     yield robot
     robot.stopped.set()
     thread.join(60)
     assert robot.faults == []
-    assert max(served.mib() - before) < 2 * MOST_PEAK_MIB, "nothing is kept"  # of many times as much
+    assert max(server.mib() - before_mib) < 2 * MOST_PEAK_MIB, "nothing is kept"  # of many times as much
 
 
 @pytest.fixture(autouse=True)
-def _others_are_unaffected(served, robot, request):
-    n_sockets = served.n_sockets
-    with served.within(MOST_LARGE_MIB if "just_under_the_limit" in request.node.name else MOST_PEAK_MIB):
+def _others_are_unaffected(server, robot, request):
+    n_sockets = server.n_sockets
+    with server.limited(MOST_LARGE_MIB if "just_under_the_limit" in request.node.name else MOST_PEAK_MIB):
         yield
         robot.answered_more(6)
-    until(lambda: served.n_sockets <= n_sockets + 2)
+    wait_until(lambda: server.n_sockets <= n_sockets + 2)
 
 
 def request(method, path, body=b"", **headers):
-    sent = {"Host": "127.0.0.1", "Connection": "close", "Content-Type": "application/json"}
-    sent |= {"Content-Length": str(len(body))} | {name.replace("_", "-"): value for name, value in headers.items()}
-    lines = [f"{method} {path} HTTP/1.1", *(f"{name}: {value}" for name, value in sent.items() if value), "", ""]
+    fields = {"Host": "127.0.0.1", "Connection": "close", "Content-Type": "application/json"}
+    fields |= {"Content-Length": str(len(body))} | {name.replace("_", "-"): value for name, value in headers.items()}
+    lines = [f"{method} {path} HTTP/1.1", *(f"{name}: {value}" for name, value in fields.items() if value), "", ""]
     return "\r\n".join(lines).encode("utf-8", "surrogateescape") + body
 
 
@@ -96,8 +96,8 @@ def problem(answer):
     return int(head[9:12]), document["code"]
 
 
-def ask(served, method, path, body=b"", **headers):
-    return problem(served.tell(request(method, path, body, **headers)))
+def ask(server, method, path, body=b"", **headers):
+    return problem(server.tell(request(method, path, body, **headers)))
 
 
 # Images
@@ -120,28 +120,28 @@ def png(pixels, size=16, remark=b""):
     return b"\x89PNG\r\n\x1a\n" + header + remark + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
-def test_an_image_that_claims_ten_thousand_million_pixels(served):
+def test_an_image_that_claims_ten_thousand_million_pixels(server):
     for _ in range(20):
-        answer = ask(served, "PUT", FRAME, png(bytes(100), 100_000), Content_Type="image/png")
+        answer = ask(server, "PUT", FRAME, png(bytes(100), 100_000), Content_Type="image/png")
         assert answer == (413, "image_too_large")
 
 
-def test_a_png_that_unpacks_to_sixteen_gibibytes(served):
+def test_a_png_that_unpacks_to_sixteen_gibibytes(server):
     bomb = png(deflate_bomb(16 * 1024))
     assert len(bomb) < 32 * MEBIBYTE
-    assert ask(served, "PUT", FRAME, bomb, Content_Type="image/png") == (422, "undecodable_image")
+    assert ask(server, "PUT", FRAME, bomb, Content_Type="image/png") == (422, "undecodable_image")
 
 
 @pytest.mark.parametrize("name", [b"zTXt", b"iCCP", b"iTXt"])
-def test_bombs_in_a_pngs_remarks(served, name):
+def test_bombs_in_a_pngs_remarks(server, name):
     head = b"a\x00\x01\x00\x00\x00" if name == b"iTXt" else b"a\x00\x00"
     body = png(zlib.compress(bytes(49 * 16)), remark=chunk(name, head + deflate_bomb(2048)))
-    answer = served.tell(request("PUT", FRAME, body, Content_Type="image/png"))
+    answer = server.tell(request("PUT", FRAME, body, Content_Type="image/png"))
     assert statuses(answer)[0] in {200, 201, 422}
 
 
-def test_many_images_just_under_the_limit_at_once(served):
-    """They wait for each other, and some are refused: memory is that of one of them, and none of it is kept."""
+def test_many_images_just_under_the_limit_at_once(server):
+    """They wait for each other or are refused, so that memory is held for one of them, and none is kept."""
     bombs = {}
     for form in ("webp", "png"):
         stream = io.BytesIO()
@@ -152,28 +152,28 @@ def test_many_images_just_under_the_limit_at_once(served):
     def send(number):
         kind, body = list(bombs.items())[number % 2]
         if number % 3 == 0:
-            return statuses(served.tell(request("PUT", FRAME, body, Content_Type=kind)))[0]
-        return ask(served, "POST", READY, body, Content_Type=kind)  # refused, when it has been looked at
+            return statuses(server.tell(request("PUT", FRAME, body, Content_Type=kind)))[0]
+        return ask(server, "POST", READY, body, Content_Type=kind)  # refused, when it has been looked at
 
-    done, looked_at = {200, 201}, (415, "unsupported_media_type")
+    stored, looked_at = {200, 201}, (415, "unsupported_media_type")
     with ThreadPoolExecutor(14) as senders:
         answers = set(senders.map(send, range(14)))
-    assert answers <= {*done, looked_at, 503, (503, "overloaded")}
-    assert answers & {*done, looked_at}
-    assert {send(0), send(3)} <= done
+    assert answers <= {*stored, looked_at, 503, (503, "overloaded")}
+    assert answers & {*stored, looked_at}
+    assert {send(0), send(3)} <= stored
 
 
 # Packed bodies
 
 
-def test_packed_bodies_are_not_unpacked(served):
+def test_packed_bodies_are_not_unpacked(server):
     bomb = gzip.compress(bytes(64 * MEBIBYTE))
     for path, coding in ((READY, "gzip"), (READY, "br"), (READY, "gzip, identity"), (BATCH, "gzip")):
-        assert ask(served, "POST", path, bomb, Content_Encoding=coding) == (415, "unsupported_media_type")
+        assert ask(server, "POST", path, bomb, Content_Encoding=coding) == (415, "unsupported_media_type")
 
 
 def batch_of(n_noughts):
-    """An npz of so many float32 noughts, of a thousandth of their bytes."""
+    """An npz of `n_noughts` float32 noughts, a thousand times smaller than they are unpacked."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, shape, kind, n_bytes in (
@@ -188,23 +188,23 @@ def batch_of(n_noughts):
     return packed.getvalue()
 
 
-def test_batches_that_unpack_to_much_more_or_lie_about_it(served):
+def test_batches_that_unpack_to_much_more_or_lie_about_it(server):
     kind = {"Content_Type": "application/octet-stream"}
     bombs = [batch_of(n_mebi * MEBIBYTE) for n_mebi in (4, 128)]
     for bomb, expected in zip(bombs, ((422, "invalid_input"), (413, "too_large")), strict=True):
         assert len(bomb) < MEBIBYTE
-        assert ask(served, "POST", BATCH, bomb, **kind) == expected
+        assert ask(server, "POST", BATCH, bomb, **kind) == expected
     length = struct.pack("<I", 4 * 4 * MEBIBYTE + 128)
     assert length in bombs[0]
     lie = bombs[0].replace(length, struct.pack("<I", 4096))
-    assert ask(served, "POST", BATCH, lie, **kind) == (422, "invalid_batch")
+    assert ask(server, "POST", BATCH, lie, **kind) == (422, "invalid_batch")
 
 
 # Slow senders
 
 
-def test_ten_thousand_chunks_of_one_byte(served, robot):
-    with served.connect() as drip:
+def test_ten_thousand_chunks_of_one_byte(server, robot):
+    with server.connect() as drip:
         drip.sendall(request("POST", READY, Content_Length="", Transfer_Encoding="chunked"))
         for n_sent, byte in enumerate(VIEW.ljust(10_000)):
             drip.sendall(b"1\r\n" + bytes([byte]) + b"\r\n")
@@ -214,19 +214,19 @@ def test_ten_thousand_chunks_of_one_byte(served, robot):
         assert drip.recv(65536).startswith(b"HTTP/1.1 200 ")
 
 
-def test_unfinished_bodies_on_many_connections_take_nobodys_turn(served, robot):
-    """Far more than may be under way at once."""
+def test_unfinished_bodies_on_many_connections_take_nobodys_turn(server, robot):
+    """There are far more such connections than requests may be under way."""
     with contextlib.ExitStack() as stack:
         for _ in range(4 * MAX_REQUESTS):
-            stack.enter_context(served.connect()).sendall(request("POST", READY, Content_Length="1000000") + b"{")
+            stack.enter_context(server.connect()).sendall(request("POST", READY, Content_Length="1000000") + b"{")
         robot.answered_more(20)
 
 
-def test_bodies_that_stop_before_their_end_share_the_room_that_there_is(served, robot):
-    """Who finds none is told so, and it is there again when they have gone; robots' small bodies need none."""
+def test_bodies_that_stop_before_their_end_share_the_room_that_there_is(server, robot):
+    """A body without room is refused, room is there again when they have gone, and robots' small bodies need none."""
     body = b" " * (4 * MEBIBYTE - 100)
     with contextlib.ExitStack() as stack:
-        slow = [stack.enter_context(served.connect()) for _ in range(40)]
+        slow = [stack.enter_context(server.connect()) for _ in range(40)]
         for connection in slow:
             with contextlib.suppress(OSError):  # refused while it was sent
                 connection.sendall(request("POST", READY, body)[:-50_000])
@@ -234,32 +234,32 @@ def test_bodies_that_stop_before_their_end_share_the_room_that_there_is(served, 
         for connection in slow:
             wait_for.register(connection, select.POLLIN)
         n_held = MAX_BODY_MEMORY // len(body)
-        until(lambda: len(wait_for.poll(0)) >= len(slow) - n_held)
+        wait_until(lambda: len(wait_for.poll(0)) >= len(slow) - n_held)
         robot.answered_more(6)
         assert len(wait_for.poll(0)) == len(slow) - n_held
-    until(lambda: ask(served, "POST", READY, body) == (422, "invalid_request"))
+    wait_until(lambda: ask(server, "POST", READY, body) == (422, "invalid_request"))
 
 
-def test_batches_that_stop_before_their_end_are_not_held_in_memory(served, robot):
+def test_batches_that_stop_before_their_end_are_not_held_in_memory(server, robot):
     kind = {"Content_Type": "application/octet-stream"}
     with contextlib.ExitStack() as stack:
         for _ in range(4):
             batch = request("POST", BATCH, bytes(60 * MEBIBYTE), **kind)
-            stack.enter_context(served.connect()).sendall(batch[:-9])
-        until(lambda: ask(served, "POST", BATCH, b"1", **kind) == (503, "overloaded"))
+            stack.enter_context(server.connect()).sendall(batch[:-9])
+        wait_until(lambda: ask(server, "POST", BATCH, b"1", **kind) == (503, "overloaded"))
         robot.answered_more(6)
-    until(lambda: ask(served, "POST", BATCH, b"1", **kind) == (422, "invalid_batch"))
+    wait_until(lambda: ask(server, "POST", BATCH, b"1", **kind) == (422, "invalid_batch"))
 
 
-def test_with_more_connections_than_may_be_all_are_told_so(served, robot):
-    """Plain words of the server: an operator's proxy keeps so many from coming."""
-    asked = request("GET", "/healthz")
+def test_with_more_connections_than_may_be_all_are_told_so(server, robot):
+    """The answer is the server's plain text, because an operator's proxy keeps so many connections away."""
+    message = request("GET", "/healthz")
     with robot.turn:  # until the server has noticed that they are gone
         with contextlib.ExitStack() as stack:
             for _ in range(MAX_CONNECTIONS):
-                stack.enter_context(served.connect())
-            until(lambda: statuses(served.tell(asked)) == [503])
-        until(lambda: statuses(served.tell(asked)) == [200])
+                stack.enter_context(server.connect())
+            wait_until(lambda: statuses(server.tell(message)) == [503])
+        wait_until(lambda: statuses(server.tell(message)) == [200])
 
 
 # Heads
@@ -284,23 +284,23 @@ POST = b"POST / HTTP/1.1\r\n" + HOST
     ],
     ids=range(10),
 )
-def test_what_is_no_request_is_answered_400_in_plain_words(served, head):
-    assert statuses(served.tell(head)) in ([400], [501])
+def test_what_is_no_request_is_answered_400_in_plain_words(server, head):
+    assert statuses(server.tell(head)) in ([400], [501])
 
 
-def test_bodies_that_end_in_two_ways_or_later_than_they_say(served):
-    """Whoever stands between might take the other one, and see another request behind it."""
-    endless = served.tell(POST + b"Content-Length: 18446744073709551615\r\nConnection: close\r\n\r\n")
+def test_bodies_that_end_in_two_ways_or_later_than_they_say(server):
+    """A proxy might heed the other length, and see another request behind the body."""
+    endless = server.tell(POST + b"Content-Length: 18446744073709551615\r\nConnection: close\r\n\r\n")
     assert problem(endless) == (413, "body_too_large")
     smuggled = b"0\r\n\r\n" + request("GET", "/v1/domains")
-    both = b"Content-Length: %d\r\nTransfer-Encoding: chunked\r\n\r\n" % len(smuggled)
-    assert problem(served.tell(POST + both + smuggled)) == (400, "unreadable_request")
+    two_lengths = b"Content-Length: %d\r\nTransfer-Encoding: chunked\r\n\r\n" % len(smuggled)
+    assert problem(server.tell(POST + two_lengths + smuggled)) == (400, "unreadable_request")
     good = request("POST", READY, VIEW, Connection="")
-    assert statuses(served.tell(good + VIEW + b"\r\n\r\n")) == [200, 400]
-    assert statuses(served.tell(good * 10 + b"garbage\r\n\r\n" + good)) == [200] * 10 + [400]
+    assert statuses(server.tell(good + VIEW + b"\r\n\r\n")) == [200, 400]
+    assert statuses(server.tell(good * 10 + b"garbage\r\n\r\n" + good)) == [200] * 10 + [400]
 
 
-def test_headers_that_are_none_of_ours(served):
+def test_headers_that_are_none_of_ours(server):
     for name, value in {
         "X-Request-ID": "a" * 10_000,
         "Idempotency-Key": "é" * 5000,
@@ -312,7 +312,7 @@ def test_headers_that_are_none_of_ours(served):
         "Expect": "the-unexpected",
         "Cookie": "a=b; " * 1000,
     }.items():
-        assert ask(served, "POST", READY, VIEW, **{name: value})[0] == 200, name
+        assert ask(server, "POST", READY, VIEW, **{name: value})[0] == 200, name
 
 
 # JSON
@@ -334,7 +334,7 @@ JSON_BODIES = {
 
 
 @pytest.mark.parametrize("kind", JSON_BODIES)
-def test_megabytes_of_json(served, kind):
+def test_megabytes_of_json(server, kind):
     for method, path in (
         ("POST", READY),
         ("PUT", "/v1/admin/domains/evil"),
@@ -342,6 +342,6 @@ def test_megabytes_of_json(served, kind):
         ("POST", "/v1/admin/domains/ready/remaps"),
         ("PUT", f"{BATCH}/0?position_m=0"),
     ):
-        status, code = ask(served, method, path, JSON_BODIES[kind])
+        status, code = ask(server, method, path, JSON_BODIES[kind])
         assert status == 422
         assert code in {"invalid_request", "invalid_ranked_landmarks", "invalid_encoding"}

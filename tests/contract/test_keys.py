@@ -12,7 +12,7 @@ from deepsimbad.cli import run as deepsimbad
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
-from .conftest import RANKS, of_one_process, path_of, problem, service, until
+from .conftest import RANKS, of_one_process, path_of, problem, service, wait_until
 
 WITHOUT_KEY = {
     "/console",
@@ -30,7 +30,7 @@ WITHOUT_KEY = {
 }
 
 
-class Keyed:
+class KeyedService:
     """A service whose data directory has an admin's key and a robot's."""
 
     def __init__(self, data_dir, client):
@@ -40,9 +40,9 @@ class Keyed:
         self.robot = {"X-API-Key": new_key(data_dir, KeyScope.LOCALIZE)}
 
 
-def new_key(data_dir, scope, **more):
+def new_key(data_dir, scope, **options):
     with Catalog.open(data_dir) as catalog:
-        return catalog.create_key(scope, **more)[1].text
+        return catalog.create_key(scope, **options)[1].text
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +50,10 @@ def keyed(tmp_path_factory):
     data_dir = tmp_path_factory.mktemp("keyed")
     with service(data_dir) as client:
         client.make_ready_domain("ready")
-        keyed = Keyed(data_dir, client)
-        until(lambda: client.get("/v1/domains").status_code == 401)
-        until(lambda: client.get("/v1/domains", headers=keyed.robot).status_code == 200)  # made after the other key
+        keyed = KeyedService(data_dir, client)
+        wait_until(lambda: client.get("/v1/domains").status_code == 401)
+        # Made after the other key, which may count before it
+        wait_until(lambda: client.get("/v1/domains", headers=keyed.robot).status_code == 200)
         yield keyed
 
 
@@ -73,15 +74,15 @@ def test_every_operation_asks_for_the_scope_that_it_declares(keyed):
             assert "401" not in operation["responses"]
             continue
         n_asked += 1
-        needed = "admin" if path.startswith("/v1/admin/") else "localize"
-        assert operation["security"] == [{"bearer": [needed]}, {"api_key": [needed]}]
+        scope = "admin" if path.startswith("/v1/admin/") else "localize"
+        assert operation["security"] == [{"bearer": [scope]}, {"api_key": [scope]}]
         assert {"401", "403", "429"} <= set(operation["responses"])
         assert "WWW-Authenticate" in operation["responses"]["401"]["headers"]
         bare = ask()
         assert "X-API-Key" in problem(bare, 401, "unauthorized")["detail"]
         assert bare.headers["www-authenticate"] == "Bearer"
         by_robot = ask(headers=keyed.robot)
-        if needed == "admin":
+        if scope == "admin":
             assert problem(by_robot, 403, "forbidden")["needed"] == "admin"
         else:
             assert by_robot.status_code not in {401, 403}, (method, path)
@@ -101,8 +102,8 @@ def test_nothing_outside_v1_is_served_but_what_needs_no_key(keyed):
 
 
 def test_without_a_key_one_does_not_even_learn_what_is_there(keyed):
-    beside = ("", "/", "/nothing", "/%61dmin/jobs", "/admin", "/admin/", "/admin/jobs/", "/admin/%2e./x")
-    for path in beside:
+    suffixes = ("", "/", "/nothing", "/%61dmin/jobs", "/admin", "/admin/", "/admin/jobs/", "/admin/%2e./x")
+    for path in suffixes:
         for method in ("GET", "HEAD", "POST", "OPTIONS", "TRACE", "PATCH", "BREW"):
             assert keyed.client.request(method, f"/v1{path}").status_code == 401, (method, path)
     for path in ("/V1/admin/jobs", "//v1/admin/jobs", "/./v1/admin/jobs", "/v1%2fadmin/jobs?", "/x/../v1/admin/jobs"):
@@ -114,10 +115,10 @@ def test_without_a_key_one_does_not_even_learn_what_is_there(keyed):
 def test_a_robot_localizes_with_its_key_and_the_log_names_it_without_the_secret(keyed, caplog):
     client, robot, secret = keyed.client, keyed.robot, keyed.robot["X-API-Key"]
     with caplog.at_level(logging.INFO, "deepsimbad"):
-        begun = client.post("/v1/domains/ready/sessions", json={}, headers=robot)
-        place = f"{path_of(begun.json())}/observations"
+        session_answer = client.post("/v1/domains/ready/sessions", json={}, headers=robot)
+        place = f"{path_of(session_answer.json())}/observations"
         answers = [
-            begun,
+            session_answer,
             client.post(place, json=RANKS, headers=robot),
             client.get("/v1/admin/jobs", headers=robot),
             client.get("/v1/admin/jobs", headers={"X-API-Key": f"{secret}x"}),
@@ -136,7 +137,7 @@ def test_a_key_may_be_for_some_domains_alone(keyed):
         {"X-API-Key": new_key(keyed.data_dir, KeyScope.LOCALIZE, domains=domains)}
         for domains in (["ready"], ["elsewhere", "other"])
     )
-    until(lambda: keyed.client.get("/v1/domains", headers=other).status_code == 200)
+    wait_until(lambda: keyed.client.get("/v1/domains", headers=other).status_code == 200)
     for method, path, body in (
         ("GET", "/v1/domains/ready", None),
         ("POST", "/v1/domains/ready/localizations", RANKS),
@@ -159,11 +160,11 @@ def test_keys_made_and_revoked_beside_a_running_service_count(tmp_path, capsys):
     with service(tmp_path) as client:
         assert client.get("/v1/domains").status_code == 200
         (key,) = re.findall(r"dsk_[\w-]+", command("create", "--scope", "localize"))  # Ray may have written there too
-        until(lambda: client.get("/v1/domains").status_code == 401)
+        wait_until(lambda: client.get("/v1/domains").status_code == 401)
         headers = {"Authorization": f"Bearer {key}"}
         assert client.get("/v1/domains", headers=headers).status_code == 200
         command("revoke", key.split("_")[1])
-        until(lambda: client.get("/v1/domains", headers=headers).status_code == 401)
+        wait_until(lambda: client.get("/v1/domains", headers=headers).status_code == 401)
         assert client.get("/readyz").status_code == 200
     with service(tmp_path) as client:
         assert client.get("/v1/domains").status_code == 401, "all revoked is closed, after a restart too"
@@ -178,8 +179,8 @@ def test_sessions_belong_to_the_key_that_began_them(tmp_path):
         client.make_ready_domain("ready")
         start = partial(client.post, "/v1/domains/ready/sessions", json={})
         path, _ = (path_of(start(headers=robot).json()) for _ in range(2))
-        about = problem(start(headers=robot), 429, "too_many_sessions")
-        assert (about["limit"], about["max_sessions_per_key"]) == ("max_sessions_per_key", 2)
+        document = problem(start(headers=robot), 429, "too_many_sessions")
+        assert (document["limit"], document["max_sessions_per_key"]) == ("max_sessions_per_key", 2)
         word = {"Idempotency-Key": "start"}  # others have room, and words, of their own
         assert len({path_of(start(headers=key | word).json()) for key in (admin, other)}) == 2
 
@@ -198,11 +199,12 @@ def test_sessions_belong_to_the_key_that_began_them(tmp_path):
             if method != "DELETE":
                 assert client.request(method, url, json=body, headers=robot).status_code == 200, url
         assert client.get(path).json()["n_observations"] == 1, "an admin knows of all"
-        listed = client.get("/v1/admin/sessions").json()["sessions"]
-        assert [session["key_id"] for session in listed].count(robot_id) == 2
+        sessions = client.get("/v1/admin/sessions").json()["sessions"]
+        assert [session["key_id"] for session in sessions].count(robot_id) == 2
 
         with Catalog.open(tmp_path) as catalog:
             catalog.revoke_key(robot_id)
-        until(lambda: len(client.get("/v1/admin/sessions").json()["sessions"]) == 2)  # a revoked key's sessions end
+        # A revoked key's sessions end
+        wait_until(lambda: len(client.get("/v1/admin/sessions").json()["sessions"]) == 2)
         problem(client.get(path), 410, "ended_session")
         problem(client.get(path, headers=other), 404, "unknown_session")

@@ -1,4 +1,4 @@
-"""Lists page by page: every entry once, whatever is made or removed between two pages."""
+"""Lists read page by page hold every entry once, whatever is made or removed between two pages."""
 
 import pytest
 
@@ -26,14 +26,14 @@ def page(client, path, **params):
 def entries(client, path, key, limit):
     """The whole list, read a page at a time."""
     rows = []
-    after = {}
+    cursor = {}
     while True:
-        answer = page(client, path, limit=limit, **after)
+        answer = page(client, path, limit=limit, **cursor)
         assert len(answer[key]) <= limit
         rows += answer[key]
         if answer["next"] is None:
             return rows
-        after = {"after": answer["next"]}
+        cursor = {"after": answer["next"]}
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +51,13 @@ def _full(client):
 @OF_FULL
 @pytest.mark.parametrize(("path", "key", "name", "expected"), LISTS)
 def test_pages_of_any_length_make_up_the_list(client, path, key, name, expected):
-    whole = page(client, path)
-    assert whole["next"] is None
-    names = [entry[name] for entry in whole[key]]
+    document = page(client, path)
+    assert document["next"] is None
+    names = [entry[name] for entry in document[key]]
     assert len(set(names)) == len(names) == len(expected)
     assert None in expected or names == expected
     for limit in (1, 2, 3, 5, 1000):
-        assert entries(client, path, key, limit) == whole[key]
+        assert entries(client, path, key, limit) == document[key]
 
 
 @OF_FULL
@@ -72,12 +72,12 @@ def test_the_last_page_says_so_even_where_it_is_full(client):
 def test_what_is_made_or_goes_meanwhile_moves_nothing(client):
     path = "/v1/admin/sessions?domain=full"
     first = page(client, path, limit=2)
-    made = client.begin("full")
+    new_session = client.begin("full")
     rest = page(client, path, after=first["next"])
-    shown = [session["session_id"] for session in first["sessions"] + rest["sessions"]]
-    assert made["session_id"] not in shown
-    assert len(set(shown)) == len(shown) == 4
-    assert client.delete(path_of(made)).status_code == 204
+    session_ids = [session["session_id"] for session in first["sessions"] + rest["sessions"]]
+    assert new_session["session_id"] not in session_ids
+    assert len(set(session_ids)) == len(session_ids) == 4
+    assert client.delete(path_of(new_session)).status_code == 204
 
     client.put("/v1/admin/domains/shrinking", json=TAKES_ENCODINGS)
     base = "/v1/admin/domains/shrinking/traverses"
@@ -109,11 +109,11 @@ def test_a_listed_session_is_the_session(client, domain):
 @OF_FULL
 @pytest.mark.parametrize("path", [path.partition("?")[0] for path, *_ in LISTS])
 def test_a_cursor_or_limit_that_cannot_be(client, path):
-    what = path.rpartition("/")[2]
-    other = "jobs-1" if what == "maps" else "maps-1"  # a cursor belongs to its list
-    wrong = ["", "1", f"{what}-", f"{what}-../x", f"{what}-1\n", other]
-    if what != "traverses":  # whose keys are names
-        wrong += [f"{what}--1", f"{what}-9999999999999999999"]
+    list_name = path.rpartition("/")[2]
+    other = "jobs-1" if list_name == "maps" else "maps-1"  # a cursor belongs to its list
+    wrong = ["", "1", f"{list_name}-", f"{list_name}-../x", f"{list_name}-1\n", other]
+    if list_name != "traverses":  # whose keys are names
+        wrong += [f"{list_name}--1", f"{list_name}-9999999999999999999"]
     for name, values in (("limit", [0, 1001, "many"]), ("after", wrong)):
         for value in values:
             answer = client.get(path, params={name: value})
@@ -122,13 +122,13 @@ def test_a_cursor_or_limit_that_cannot_be(client, path):
 
 @OF_FULL
 def test_domains_come_in_pages_by_name(client):
-    whole = page(client, "/v1/domains")
-    names = [domain["name"] for domain in whole["domains"]]
-    assert whole["next"] is None
+    document = page(client, "/v1/domains")
+    names = [domain["name"] for domain in document["domains"]]
+    assert document["next"] is None
     assert names == sorted(names)
     assert {"full", "ready"} <= set(names)
     for limit in (1, 2, 1000):
-        assert entries(client, "/v1/domains", "domains", limit) == whole["domains"]
+        assert entries(client, "/v1/domains", "domains", limit) == document["domains"]
     assert [domain["name"] for domain in page(client, "/v1/domains", limit=1, after="domains-full0")["domains"]] == [
         next(name for name in names if name > "full0")
     ]

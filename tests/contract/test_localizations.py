@@ -57,7 +57,7 @@ def test_the_answer_has_every_member_of_the_contract(client):
     pieces = belief["credible_95_sets_m"]
     assert [pieces[0][0], pieces[-1][1]] == belief["credible_95_m"]
     assert all(low <= high for low, high in pieces)
-    assert all(piece[1] < after[0] for piece, after in itertools.pairwise(pieces))
+    assert all(piece[1] < following[0] for piece, following in itertools.pairwise(pieces))
     assert any(low <= belief["mode_m"] <= high for low, high in pieces)
     assert len(belief["histogram"]["edges_m"]) == len(belief["histogram"]["mass"]) + 1 <= 201
     assert sum(belief["histogram"]["mass"]) == pytest.approx(1)
@@ -90,19 +90,19 @@ def test_a_map_frames_own_encoding_is_found_again_and_unknown_coordinates_are_nu
 )
 def test_a_picture_that_lies_on_its_side_or_is_of_another_shape_is_answered_with_a_warning(client, turn, size, says):
     view = picture(7) if turn is None else cv2.rotate(picture(7), turn)
-    sent = {"content": encoded(cv2.resize(view, size), ".tiff"), "headers": {"Content-Type": "image/tiff"}}
+    view_request = {"content": encoded(cv2.resize(view, size), ".tiff"), "headers": {"Content-Type": "image/tiff"}}
     session = client.begin("seen")
-    answers = [client.post("/v1/domains/seen/localizations", **sent).json()]
-    sent["headers"]["Idempotency-Key"] = "once"
-    answers += [client.post(f"{path_of(session)}/observations", **sent).json() for _ in range(2)]
+    answers = [client.post("/v1/domains/seen/localizations", **view_request).json()]
+    view_request["headers"]["Idempotency-Key"] = "once"
+    answers += [client.post(f"{path_of(session)}/observations", **view_request).json() for _ in range(2)]
     for answer in answers:
         assert [says in warning for warning in answer["warnings"] if "pixels" in warning] == [True] * (says is not None)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "pjpeg", "tif", "x-png", "X-TIFF"])
 def test_types_that_are_spelt_otherwise_are_taken_and_the_bytes_say_what_it_is(client, kind):
-    sent = {"content": encoded(picture(7)), "headers": {"Content-Type": f"image/{kind}"}}
-    answer = client.post("/v1/domains/seen/localizations", **sent)
+    view_request = {"content": encoded(picture(7)), "headers": {"Content-Type": f"image/{kind}"}}
+    answer = client.post("/v1/domains/seen/localizations", **view_request)
     assert answer.json()["retrieval"][0]["map_image"] == 7
 
 
@@ -117,8 +117,8 @@ def test_a_byte_order_mark_before_json_is_passed_over(client):
 
 @pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
 def test_images_of_all_types_are_found_again(client, kind):
-    sent = {"content": encoded(picture(7), f".{kind}"), "headers": {"Content-Type": f"image/{kind}"}}
-    answer = client.post("/v1/domains/seen/localizations", **sent)
+    view_request = {"content": encoded(picture(7), f".{kind}"), "headers": {"Content-Type": f"image/{kind}"}}
+    answer = client.post("/v1/domains/seen/localizations", **view_request)
     assert answer.status_code == 200, answer.text
     assert answer.json()["retrieval"][0]["map_image"] == 7
     assert answer.json()["belief"]["top"][0]["frame"] == "Straße 7.png"
@@ -135,8 +135,8 @@ def test_dissimilarities_by_the_served_landmark_model_are_answered_as_the_encodi
         by_encoding = localized(client, {"encoding": ready_encodings()[index].tolist()})
         on_board = localized(client, {"dissimilarities": dissimilarities.tolist()})
         assert by_encoding["retrieval"][0]["map_image"] == index
-        for one, other in zip(on_board["retrieval"], by_encoding["retrieval"], strict=True):
-            assert one == {**other, "relevance": pytest.approx(other["relevance"], abs=1e-5)}
+        for board_entry, encoding_entry in zip(on_board["retrieval"], by_encoding["retrieval"], strict=True):
+            assert board_entry == {**encoding_entry, "relevance": pytest.approx(encoding_entry["relevance"], abs=1e-5)}
         assert on_board["belief"]["entropy_bits"] == pytest.approx(by_encoding["belief"]["entropy_bits"], abs=1e-4)
         ranked = np.argsort(dissimilarities, kind="stable").tolist()
         by_ranks = localized(client, {"ranked_landmarks": ranked})["retrieval"]
@@ -155,9 +155,9 @@ def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer_where_ran
     job = client.remap(domain, landmark_traverse="drive", n_landmarks=N_LANDMARKS, relevance="rrf")
     assert job["state"] == "succeeded", job
     encodings = ready_encodings().astype(np.float64)
-    apart = np.square(encodings[:, None] - encodings[None]).sum(axis=2)
-    np.fill_diagonal(apart, np.inf)
-    landmarks = encodings[np.argsort(-apart.min(axis=1), kind="stable")[:N_LANDMARKS]]
+    squared_distances = np.square(encodings[:, None] - encodings[None]).sum(axis=2)
+    np.fill_diagonal(squared_distances, np.inf)
+    landmarks = encodings[np.argsort(-squared_distances.min(axis=1), kind="stable")[:N_LANDMARKS]]
     dissimilarities = np.square(landmarks - encodings[11]).sum(axis=1)
     ranked = np.argsort(dissimilarities, kind="stable")
     answers = [
@@ -205,15 +205,15 @@ def test_a_map_smaller_than_the_default_shortlist_gives_all_it_has(client):
 
 
 def test_the_domain_tells_of_its_map(client):
-    about = client.get("/v1/domains/ready").json()
+    description = client.get("/v1/domains/ready").json()
     expected = {"name": "ready", "map_version": 1, "map_problem": None, "input_size": None, **TAKES_ENCODINGS}
     expected |= {"n_map_images": N_READY, "n_landmarks": N_LANDMARKS, "list_length": 4}
     expected |= {"route_length_m": 2.0 * (N_READY - 1), "actions_m": [float(action) for action in range(1, 11)]}
-    assert about == {**about, **expected}
-    assert about["index_bits_per_map_image"] > 0
-    seen = client.get("/v1/domains/seen").json()
-    assert (seen["n_map_images"], len(seen["input_size"])) == (N_SEEN, 2)
+    assert description == {**description, **expected}
+    assert description["index_bits_per_map_image"] > 0
+    image_domain = client.get("/v1/domains/seen").json()
+    assert (image_domain["n_map_images"], len(image_domain["input_size"])) == (N_SEEN, 2)
     unmapped = client.get("/v1/domains/unmapped").json()
     assert (unmapped["map_version"], unmapped["n_map_images"]) == (None, None)
     domains = {domain["name"]: domain for domain in client.get("/v1/domains").json()["domains"]}
-    assert (domains["ready"], domains["unmapped"]) == (about, unmapped)
+    assert (domains["ready"], domains["unmapped"]) == (description, unmapped)

@@ -7,7 +7,7 @@ import pytest
 
 from .conftest import JSON, RANKS, of_one_process, path_of, service
 
-pytestmark = of_one_process  # and reads its log
+pytestmark = of_one_process  # whose log is read
 
 ALL = ("request_id", "peer", "method", "path", "status", "key_id", "domain", "session_id", "job_id", "code")
 
@@ -19,7 +19,7 @@ def lines(caplog):
 
 
 def last(lines, *names):
-    """Of the last request's line, what it has of these names."""
+    """The fields of these names in the last request's line, without those that it lacks."""
     line = [vars(record) for record in lines.records if record.name == "deepsimbad.api.door"][-1]
     return {name: line[name] for name in names if name in line}
 
@@ -27,8 +27,14 @@ def last(lines, *names):
 def test_a_line_tells_what_the_request_was_about(client, lines):
     answer = client.get("/v1/domains/ready", headers={"X-Request-ID": "mine-1"})
     assert answer.headers["x-request-id"] == "mine-1"
-    about = {"request_id": "mine-1", "peer": "testclient", "method": "GET", "path": "/v1/domains/ready", "status": 200}
-    assert last(lines, *ALL) == {**about, "domain": "ready"}
+    expected = {
+        "request_id": "mine-1",
+        "peer": "testclient",
+        "method": "GET",
+        "path": "/v1/domains/ready",
+        "status": 200,
+    }
+    assert last(lines, *ALL) == {**expected, "domain": "ready"}
     assert last(lines, "ms")["ms"] > 0
     session = client.begin()
     path, session_id = path_of(session), session["session_id"]
@@ -36,8 +42,8 @@ def test_a_line_tells_what_the_request_was_about(client, lines):
     assert last(lines, "session_id", "domain", "code") == {"session_id": session_id, "domain": "ready"}
     client.delete(path)
     client.get(path)
-    ended = {"session_id": session_id, "status": 410, "code": "ended_session"}
-    assert last(lines, "session_id", "status", "code") == ended
+    expected_end = {"session_id": session_id, "status": 410, "code": "ended_session"}
+    assert last(lines, "session_id", "status", "code") == expected_end
     client.get("/" + "x" * 5000)
     assert len(last(lines, "path")["path"]) < 300
 
@@ -59,8 +65,8 @@ def test_jobs_and_maps_that_serve_are_told(tmp_path, lines):
         client.put("/v1/admin/domains/ready/active-map", json={"version": 1})
     jobs = [vars(record) for record in lines.records if record.message in {"job started", "job ended"}]
     assert [line["message"] for line in jobs] == ["job started", "job ended"] * 2
-    ended = {"domain": "ready", "kind": "remap", "state": "succeeded", "map_version": 2, "active": True}
-    assert {name: jobs[-1][name] for name in ended} == ended
+    expected = {"domain": "ready", "kind": "remap", "state": "succeeded", "map_version": 2, "active": True}
+    assert {name: jobs[-1][name] for name in expected} == expected
     switched = [vars(record) for record in lines.records if record.message.startswith("map ")]
     assert [(line["message"], line["domain"], line["map_version"], line["before"]) for line in switched] == [
         ("map activated", "ready", 1, None),

@@ -1,4 +1,4 @@
-"""The life of map versions over HTTP: checked, gated, appended to, switched, downloaded, removed."""
+"""Map versions over HTTP: how they are checked, gated, appended to, switched, downloaded and removed."""
 
 import base64
 import hashlib
@@ -7,9 +7,9 @@ import io
 import numpy as np
 import pytest
 
-from .conftest import DIM, IS_FLEET, N_READY, RANKS, TAKES_ENCODINGS, problem, ready_encodings, service, until
+from .conftest import DIM, IS_FLEET, N_READY, RANKS, TAKES_ENCODINGS, problem, ready_encodings, service, wait_until
 
-SAME = {"same_route": True}
+SAME_ROUTE = {"same_route": True}
 
 
 def versions(client, domain):
@@ -53,15 +53,15 @@ def test_more_landmarks_than_frames_are_refused_at_once_and_none_asked_for_are_a
     assert client.put("/v1/admin/domains/fitting", json=TAKES_ENCODINGS).status_code == 201
     client.upload("fitting", "drive", ready_encodings(), np.arange(N_READY))
     client.upload("fitting", "short", noise(3, 12), np.arange(12))
-    more = {"training_traverse": "drive", "n_landmarks": N_READY + 1}
-    refused = problem(client.post(remaps, json=more), 422, "too_few_candidates")
+    config = {"training_traverse": "drive", "n_landmarks": N_READY + 1}
+    refused = problem(client.post(remaps, json=config), 422, "too_few_candidates")
     assert f"{N_READY} is the most that fit" in refused["detail"]
     assert refused["n_candidates"] == N_READY
-    more = {"training_traverse": "drive", "landmark_traverse": "short", "n_landmarks": 13}
-    assert problem(client.post(remaps, json=more), 422, "too_few_candidates")["n_candidates"] == 12
+    config = {"training_traverse": "drive", "landmark_traverse": "short", "n_landmarks": 13}
+    assert problem(client.post(remaps, json=config), 422, "too_few_candidates")["n_candidates"] == 12
     assert client.get("/v1/admin/jobs", params={"domain": "fitting"}).json()["jobs"] == []
-    made = client.wait_for(client.post(remaps, json={"training_traverse": "drive"}).json()["job_id"])
-    assert made["result"]["metrics"]["n_landmarks"] == N_READY
+    job = client.wait_for(client.post(remaps, json={"training_traverse": "drive"}).json()["job_id"])
+    assert job["result"]["metrics"]["n_landmarks"] == N_READY
 
 
 def test_versions_are_switched_and_rolled_back(client, domain):
@@ -75,8 +75,8 @@ def test_versions_are_switched_and_rolled_back(client, domain):
 
     old = answer()
     assert states(client, domain) == {2: "sealed", 1: "active"}
-    switched = client.put(active, json={"version": 2, "expected": 1})
-    assert (switched.status_code, switched.json()["state"]) == (200, "active")
+    response = client.put(active, json={"version": 2, "expected": 1})
+    assert (response.status_code, response.json()["state"]) == (200, "active")
     assert states(client, domain) == {2: "active", 1: "retired"}
     assert answer()[0] == 2
     problem(client.put(active, json={"version": 1, "expected": 1}), 409, "lost_activation")
@@ -89,15 +89,15 @@ def test_versions_are_switched_and_rolled_back(client, domain):
 def test_a_worse_map_is_sealed_but_not_activated_and_says_why(client, domain):
     client.upload(domain, "noise", noise(1), 2.0 * np.arange(N_READY))
     client.upload(domain, "day", ready_encodings() + 0.01, 2.0 * np.arange(N_READY))
-    asked = {"training_traverse": "noise", "check_traverse": "day", "gate_margin": 1}
-    job = client.remap(domain, **asked)
+    config = {"training_traverse": "noise", "check_traverse": "day", "gate_margin": 1}
+    job = client.remap(domain, **config)
     assert (job["state"], job["result"]["active"], job["config"]["gate_margin"]) == ("succeeded", False, 1)
     check = job["result"]["metrics"]["check"]
     assert check["passed"] is False
     assert "more than 1 above" in check["why"]
     assert states(client, domain) == {2: "sealed", 1: "active"}
     assert client.get(f"/v1/domains/{domain}").json()["map_version"] == 1
-    assert client.remap(domain, **asked | {"gate_margin": None})["result"]["active"] is True
+    assert client.remap(domain, **config | {"gate_margin": None})["result"]["active"] is True
 
 
 def test_frames_are_appended_to_the_map_that_serves(client, domain):
@@ -105,8 +105,12 @@ def test_frames_are_appended_to_the_map_that_serves(client, domain):
     assert client.delete(f"/v1/admin/domains/{domain}/traverses/drive").status_code == 204
     job = client.remap(domain, training_traverse="further", append=True)
     assert job["state"] == "succeeded", job
-    about = client.get(f"/v1/domains/{domain}").json()
-    assert (about["map_version"], about["n_map_images"], about["route_length_m"]) == (2, N_READY + 10, 89.0)
+    description = client.get(f"/v1/domains/{domain}").json()
+    assert (description["map_version"], description["n_map_images"], description["route_length_m"]) == (
+        2,
+        N_READY + 10,
+        89.0,
+    )
     encoding = {"encoding": noise(2, 10)[4].tolist()}
     retrieval = client.post(f"/v1/domains/{domain}/localizations", json=encoding).json()["retrieval"]
     assert retrieval[0]["route_position_m"] == 84.0
@@ -114,13 +118,13 @@ def test_frames_are_appended_to_the_map_that_serves(client, domain):
 
 
 def test_what_the_map_holds_is_refused_before_it_is_appended_again(client, domain):
-    """With its old images left in the copy the frames would find themselves, and any gate would open."""
-    asked = {"training_traverse": "drive", "append": True, "gate_margin": 2}
-    answer = client.post(f"/v1/admin/domains/{domain}/remaps", json=asked)
+    """Else the frames would find their own images in the copy of the map, and any gate would open."""
+    config = {"training_traverse": "drive", "append": True, "gate_margin": 2}
+    answer = client.post(f"/v1/admin/domains/{domain}/remaps", json=config)
     detail = problem(answer, 422, "invalid_map_config")["detail"]
     assert "map 1, which serves, holds traverse drive already" in detail
     client.upload(domain, "again", ready_encodings(), np.arange(N_READY))
-    job = client.remap(domain, **asked | {"training_traverse": "again"})
+    job = client.remap(domain, **config | {"training_traverse": "again"})
     assert (job["state"], job["error"]["code"]) == ("failed", "invalid_map_config")
     assert "holds every frame of traverse again already, under another name" in job["error"]["detail"]
     assert list(versions(client, domain)) == [1]
@@ -130,16 +134,16 @@ def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client
     """The drive knows x, y of its own; the other one does not."""
     client.upload(domain, "again", ready_encodings() + 0.1 * noise(1), 2.0 * np.arange(N_READY))
     client.upload(domain, "noise", noise(2), 2.0 * np.arange(N_READY))
-    asked = {"training_traverse": "drive", "landmark_traverse": "again", "training_episodes": 0}
-    told = [client.remap(domain, **asked, **said)["result"]["metrics"] for said in ({}, SAME)]
-    unsaid, same = (metrics["second_season"] for metrics in told)
-    assert [len(metrics["warnings"]) for metrics in told] == [0, 1]
-    assert "look nearly the same" in told[1]["warnings"][0]
-    assert (unsaid["accepted"], same["accepted"]) == (False, True)
-    assert "say same_route" in unsaid["why"]
-    assert (same["why"], same["n_pairs"]) == (None, N_READY)
-    assert 0 <= same["significance"] < 0.001 < same["statistic"]
-    job = client.remap(domain, **asked | SAME | {"landmark_traverse": "noise"})
+    config = {"training_traverse": "drive", "landmark_traverse": "again", "training_episodes": 0}
+    metrics_of = [client.remap(domain, **config, **options)["result"]["metrics"] for options in ({}, SAME_ROUTE)]
+    unsaid_season, same_season = (metrics["second_season"] for metrics in metrics_of)
+    assert [len(metrics["warnings"]) for metrics in metrics_of] == [0, 1]
+    assert "look nearly the same" in metrics_of[1]["warnings"][0]
+    assert (unsaid_season["accepted"], same_season["accepted"]) == (False, True)
+    assert "say same_route" in unsaid_season["why"]
+    assert (same_season["why"], same_season["n_pairs"]) == (None, N_READY)
+    assert 0 <= same_season["significance"] < 0.001 < same_season["statistic"]
+    job = client.remap(domain, **config | SAME_ROUTE | {"landmark_traverse": "noise"})
     season = job["result"]["metrics"]["second_season"]
     assert (season["accepted"], job["config"]["same_route"]) == (False, True)
     assert "agree no better" in season["why"]
@@ -147,13 +151,13 @@ def test_a_second_season_is_learnt_from_where_the_route_is_said_to_be_one(client
 
 
 def test_landmarks_come_from_where_they_are_asked_for_or_known(client):
-    """The map's own drive on a new domain; the map that serves after that, as long as its landmarks are of a kind."""
+    """A new domain takes those of its own drive, later maps those of the active map where its relevance allows it."""
     assert client.put("/v1/admin/domains/fresh", json=TAKES_ENCODINGS).status_code == 201
     client.upload("fresh", "drive", ready_encodings(), 2.0 * np.arange(N_READY))
     client.upload("fresh", "again", ready_encodings() + 0.1 * noise(1), 2.0 * np.arange(N_READY))
 
-    def about(n_expected, **asked):
-        job = client.remap("fresh", list_length=3, **asked)
+    def landmarks_of(n_expected, **config):
+        job = client.remap("fresh", list_length=3, **config)
         assert job["state"] == "succeeded", job
         domain = client.get("/v1/domains/fresh").json()
         assert domain["n_landmarks"] == n_expected
@@ -161,30 +165,30 @@ def test_landmarks_come_from_where_they_are_asked_for_or_known(client):
         model = client.get("/v1/domains/fresh/landmark-model")
         assert model.headers["etag"] == f'"{domain["landmark_model_digest"]}"'
         arrays = np.load(io.BytesIO(model.content))
-        usual = arrays["usual"].tolist() if "usual" in arrays else None
-        return job["result"]["metrics"]["landmarks"], arrays["prototypes"].tolist(), usual
+        statistics = arrays["usual"].tolist() if "usual" in arrays else None
+        return job["result"]["metrics"]["landmarks"], arrays["prototypes"].tolist(), statistics
 
-    source, own, usual = about(12, n_landmarks=12)
+    source, prototypes, statistics = landmarks_of(12, n_landmarks=12)
     assert source == "training_traverse"
     body = {"encoding": ready_encodings()[17].tolist()}
-    found = client.post("/v1/domains/fresh/localizations", json=body).json()
-    assert found["retrieval"][0]["map_image"] == 17
-    again = about(12, training_traverse="again")
-    assert again[:2] == ("active_map", own)
-    assert again[2] != usual, "what is usual for robots that encode on board is of the drive that is mapped"
-    source, *other = about(9, landmark_traverse="again", n_landmarks=9)
+    answer = client.post("/v1/domains/fresh/localizations", json=body).json()
+    assert answer["retrieval"][0]["map_image"] == 17
+    retraining = landmarks_of(12, training_traverse="again")
+    assert retraining[:2] == ("active_map", prototypes)
+    assert retraining[2] != statistics, "what is usual for robots that encode on board is of the drive that is mapped"
+    source, *learnt = landmarks_of(9, landmark_traverse="again", n_landmarks=9)
     assert source == "landmark_traverse"
-    assert about(9) == ("active_map", *other)
-    assert about(9, relevance="rrf", n_landmarks=9)[0] == "training_traverse"
-    assert about(9, relevance="standardised")[0] == "active_map"
-    assert about(N_READY, relevance="composed")[0] == "training_traverse"
+    assert landmarks_of(9) == ("active_map", *learnt)
+    assert landmarks_of(9, relevance="rrf", n_landmarks=9)[0] == "training_traverse"
+    assert landmarks_of(9, relevance="standardised")[0] == "active_map"
+    assert landmarks_of(N_READY, relevance="composed")[0] == "training_traverse"
 
 
 def test_a_closed_route_is_a_loop(client):
     client.make_ready_domain("loop", closed=True, actions_m=[2.5])
-    about = client.get("/v1/domains/loop").json()
-    assert (about["closed"], about["actions_m"]) == (True, [2.5])
-    assert about["route_length_m"] > 2.0 * (N_READY - 1)
+    description = client.get("/v1/domains/loop").json()
+    assert (description["closed"], description["actions_m"]) == (True, [2.5])
+    assert description["route_length_m"] > 2.0 * (N_READY - 1)
     body = {"encoding": ready_encodings()[0].tolist()}
     assert client.post("/v1/domains/loop/localizations", json=body).status_code == 200
 
@@ -222,32 +226,32 @@ NO_RANGE = ("bytes=0-1,5-9", "lines=0-3", "bytes=-", "bytes=9-3", "bytes", "byte
 
 
 def test_part_of_it_can_be_asked_for(client):
-    whole = client.get(place_of("ready"))
-    n_bytes = len(whole.content)
-    for asked, (start, stop) in RANGES.items():
-        part = client.get(place_of("ready"), headers={"Range": asked})
-        assert (part.status_code, part.content) == (206, whole.content[start:stop]), asked
+    file = client.get(place_of("ready"))
+    n_bytes = len(file.content)
+    for byte_range, (start, stop) in RANGES.items():
+        part = client.get(place_of("ready"), headers={"Range": byte_range})
+        assert (part.status_code, part.content) == (206, file.content[start:stop]), byte_range
         assert int(part.headers["content-length"]) == len(part.content)
         first = start % n_bytes
         assert part.headers["content-range"] == f"bytes {first}-{first + len(part.content) - 1}/{n_bytes}"
-        assert [part.headers[name] == whole.headers[name] for name in ("etag", "repr-digest")] == [True, True]
-    for asked in NO_RANGE:
-        answer = client.get(place_of("ready"), headers={"Range": asked})
-        assert (answer.status_code, answer.content) == (200, whole.content), asked
-    for asked in (f"bytes={n_bytes}-", "bytes=-0"):
-        answer = client.get(place_of("ready"), headers={"Range": asked})
+        assert [part.headers[name] == file.headers[name] for name in ("etag", "repr-digest")] == [True, True]
+    for byte_range in NO_RANGE:
+        answer = client.get(place_of("ready"), headers={"Range": byte_range})
+        assert (answer.status_code, answer.content) == (200, file.content), byte_range
+    for byte_range in (f"bytes={n_bytes}-", "bytes=-0"):
+        answer = client.get(place_of("ready"), headers={"Range": byte_range})
         problem(answer, 416, "range_not_satisfiable")
         assert answer.headers["content-range"] == f"bytes */{n_bytes}"
 
 
 def test_a_download_goes_on_only_with_the_same_bytes(client):
-    whole = client.get(place_of("ready"))
-    etag = whole.headers["etag"]
+    file = client.get(place_of("ready"))
+    etag = file.headers["etag"]
     for headers, status, content in (
-        ({"Range": "bytes=9-", "If-Range": etag}, 206, whole.content[9:]),
-        ({"Range": "bytes=9-", "If-Range": '"sha256:0"'}, 200, whole.content),
+        ({"Range": "bytes=9-", "If-Range": etag}, 206, file.content[9:]),
+        ({"Range": "bytes=9-", "If-Range": '"sha256:0"'}, 200, file.content),
         ({"If-None-Match": f'"else", {etag}'}, 304, b""),
-        ({"If-None-Match": '"else"'}, 200, whole.content),
+        ({"If-None-Match": '"else"'}, 200, file.content),
     ):
         answer = client.get(place_of("ready"), headers=headers)
         assert (answer.status_code, answer.content, answer.headers["etag"]) == (status, content, etag)
@@ -261,9 +265,9 @@ def test_a_damaged_file_is_not_sent(client, domain, data_dir):
     body = bytearray(path.read_bytes())
     body[len(body) // 2] ^= 1
     path.write_bytes(body)
-    about = problem(client.get(place_of(domain)), 503, "damaged_map")
-    assert about["map_version"] == 1
-    assert str(data_dir) not in str(about)
+    document = problem(client.get(place_of(domain)), 503, "damaged_map")
+    assert document["map_version"] == 1
+    assert str(data_dir) not in str(document)
     path.unlink()
     problem(client.get(place_of(domain)), 503, "damaged_map")
 
@@ -291,8 +295,8 @@ def test_an_old_version_is_removed_by_hand(client, domain, data_dir):
     assert "a session lives on map 1" in detail
     assert client.post(f"{session}/observations", json=RANKS).json()["map_version"] == 1
     assert client.delete(session).status_code == 204
-    gone = client.delete(f"{place}/maps/1")
-    assert (gone.status_code, gone.content) == (204, b"")
+    deletion = client.delete(f"{place}/maps/1")
+    assert (deletion.status_code, deletion.content) == (204, b"")
     assert not (data_dir / "domains" / domain / "maps" / "000001.sqlite").exists()
     row = versions(client, domain)[1]
     assert (row["state"], row["removed_at"] is not None, row["file_bytes"] > 0) == ("retired", True, True)
@@ -329,7 +333,7 @@ def test_versions_beyond_those_kept_lose_their_files(tmp_path):
         assert files() == [1, 3, 4]
         assert client.post(f"{session}/observations", json=RANKS).json()["map_version"] == 1
         assert client.delete(session).status_code == 204
-        until(lambda: files() == [3, 4])
+        wait_until(lambda: files() == [3, 4])
         assert versions(client, "route")[2]["removed_at"] == removed_at
         assert len(versions(client, "route")) == 4
 
@@ -344,8 +348,8 @@ def route_seen(route, drive):
     """A drive of a route in a season of its own; a season changes every fourth number of a place."""
     place = np.random.default_rng(route).normal(size=(140, D_SEEN))
     rng = np.random.default_rng(100 * route + drive)
-    changed = 4 * rng.normal(size=place.shape) * (np.arange(D_SEEN) % 4 == 0)
-    return (rng.normal(size=D_SEEN) + place + changed + 0.2 * rng.normal(size=place.shape)).astype(np.float32)
+    season_change = 4 * rng.normal(size=place.shape) * (np.arange(D_SEEN) % 4 == 0)
+    return (rng.normal(size=D_SEEN) + place + season_change + 0.2 * rng.normal(size=place.shape)).astype(np.float32)
 
 
 @pytest.fixture
@@ -355,54 +359,54 @@ def yard(client):
         assert client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS).status_code == 201
         for drive, traverse in enumerate(("drive", "winter") if name == "yard" else ("drive",)):
             client.upload(name, traverse, route_seen(5 if name == "lane" else 4, drive), np.arange(140.0))
-    about = {"training_episodes": 0, "n_landmarks": 60}
-    job = client.remap("yard", landmark_traverse="winter", same_route=True, **about)
+    options = {"training_episodes": 0, "n_landmarks": 60}
+    job = client.remap("yard", landmark_traverse="winter", same_route=True, **options)
     assert job["result"]["metrics"]["second_season"]["accepted"] is True
     assert job["result"]["metrics"]["camera_of"] is None
-    yield about
+    yield options
     for name in ("yard", "lane"):
         assert client.delete(f"/v1/admin/domains/{name}").status_code == 204
 
 
 def test_what_a_cameras_seasons_teach_serves_its_other_routes(client, yard):
-    def found(**asked):
-        job = client.remap("lane", **yard, **asked)
+    def n_hits_of(**options):
+        job = client.remap("lane", **yard, **options)
         assert job["state"] == "succeeded", job["error"]
-        hits = 0
+        n_hits = 0
         for frame, encoding in enumerate(route_seen(5, 7).astype(float).tolist()):
             answer = client.post("/v1/domains/lane/localizations", json={"encoding": encoding}).json()
-            hits += answer["retrieval"][0]["map_image"] == frame
-        return hits, job["result"]["metrics"]["camera_of"]
+            n_hits += answer["retrieval"][0]["map_image"] == frame
+        return n_hits, job["result"]["metrics"]["camera_of"]
 
-    alone, by_camera = found(), found(camera_of="yard")
-    assert (alone[1], by_camera[1]) == (None, "yard")
-    assert by_camera[0] > alone[0] + 5
+    without_camera, by_camera = n_hits_of(), n_hits_of(camera_of="yard")
+    assert (without_camera[1], by_camera[1]) == (None, "yard")
+    assert by_camera[0] > without_camera[0] + 5
     client.upload("lane", "winter", route_seen(5, 1), np.arange(140.0))
-    seen_twice = found(camera_of="yard", landmark_traverse="winter", same_route=True)
+    seen_twice = n_hits_of(camera_of="yard", landmark_traverse="winter", same_route=True)
     assert seen_twice[1] is None, "what this route itself taught counts"
 
 
 def test_a_camera_that_cannot_serve_is_named(client, yard):
-    def why(domain="lane", **asked):
-        job = client.remap(domain, **yard, **asked)
+    def failure_of(domain="lane", **options):
+        job = client.remap(domain, **yard, **options)
         assert job["state"] == "failed", job
         return job["error"]["code"], job["error"]["detail"]
 
     body = {"training_traverse": "drive"}
     path = "/v1/admin/domains/lane/remaps"
     problem(client.post(path, json={**body, "camera_of": "nowhere"}), 404, "unknown_domain")
-    for more in ({"relevance": "rrf"}, {"append": True}):
-        problem(client.post(path, json={**body, "camera_of": "yard", **more}), 422, "invalid_map_config")
+    for conflict in ({"relevance": "rrf"}, {"append": True}):
+        problem(client.post(path, json={**body, "camera_of": "yard", **conflict}), 422, "invalid_map_config")
     for other, says in (("lane", "names domain lane itself"), ("seen", "another evaluator")):
         refused = problem(client.post(path, json={**body, "camera_of": other}), 422, "invalid_map_config")
         assert says in refused["detail"]
-    assert why("yard", camera_of="lane")[0] == "no_active_map"
+    assert failure_of("yard", camera_of="lane")[0] == "no_active_map"
     assert client.remap("lane", **yard)["state"] == "succeeded"
-    assert "knows no second season" in why("yard", camera_of="lane")[1]
+    assert "knows no second season" in failure_of("yard", camera_of="lane")[1]
     assert client.put("/v1/admin/domains/short", json=TAKES_ENCODINGS).status_code == 201
     client.upload("short", "drive", route_seen(5, 0)[:, :9], np.arange(140.0))
-    code, says = why("short", camera_of="yard")
+    code, says = failure_of("short", camera_of="yard")
     assert (code, "encodings of 16 numbers, not of 9" in says) == ("invalid_encoding", True)
     assert client.delete("/v1/admin/domains/short").status_code == 204
     assert client.delete("/v1/admin/domains/yard/traverses/winter").status_code == 204
-    assert "made of traverse winter, which is not in this data directory" in why(camera_of="yard")[1]
+    assert "made of traverse winter, which is not in this data directory" in failure_of(camera_of="yard")[1]

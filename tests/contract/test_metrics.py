@@ -15,7 +15,7 @@ STAGES["observations"] = COMMON | {"predict", "update", "commit", "summarise"}
 
 
 @pytest.fixture
-def own(tmp_path):
+def own_client(tmp_path):
     with service(tmp_path) as client:
         client.make_ready_domain("ready")
         yield client
@@ -29,60 +29,60 @@ def scraped(client):
 
 
 def test_metrics_count_by_route_and_not_by_path_each_application_for_itself(client, tmp_path):
-    counted = 'deepsimbad_requests_total{method="POST",route="/v1/domains/{domain}/localizations",status="200"}'
-    before = scraped(client).get(counted, 0)
+    series = 'deepsimbad_requests_total{method="POST",route="/v1/domains/{domain}/localizations",status="200"}'
+    n_before = scraped(client).get(series, 0)
     client.post("/v1/domains/ready/localizations", json=RANKS)
     client.get("/v1/domains/some-unknown-name")
     client.get("/some/unknown/path")
-    shown = scraped(client)
-    assert shown[counted] == before + 1
-    assert 'deepsimbad_localization_stage_seconds_count{stage="retrieve"}' in shown
-    assert 'deepsimbad_belief_entropy_bits_count{domain="ready"}' in shown
-    assert not [name for name in shown if "unknown-name" in name or "/some/unknown" in name]
+    values = scraped(client)
+    assert values[series] == n_before + 1
+    assert 'deepsimbad_localization_stage_seconds_count{stage="retrieve"}' in values
+    assert 'deepsimbad_belief_entropy_bits_count{domain="ready"}' in values
+    assert not [name for name in values if "unknown-name" in name or "/some/unknown" in name]
     with service(tmp_path) as other:
         assert not [name for name in scraped(other) if name.startswith("deepsimbad_requests_total{")]
 
 
-def test_a_map_and_the_last_remap(own):
-    shown = scraped(own)
-    assert shown['deepsimbad_active_map_version{domain="ready"}'] == 1
-    assert shown['deepsimbad_map_images{domain="ready"}'] == N_READY
-    bits = own.get("/v1/domains/ready").json()["index_bits_per_map_image"]
-    assert shown['deepsimbad_map_index_bytes{domain="ready"}'] == pytest.approx(bits * N_READY / 8)
-    assert 0 <= shown['deepsimbad_map_age_seconds{domain="ready"}'] < 3600
-    assert shown['deepsimbad_map_damaged{domain="ready"}'] == 0
-    assert shown["deepsimbad_domains"] == shown["deepsimbad_loaded_maps"] == 1
-    assert (shown['deepsimbad_jobs{state="succeeded"}'], shown['deepsimbad_jobs{state="failed"}']) == (1, 0)
-    assert shown['deepsimbad_job_seconds_count{kind="remap",state="succeeded"}'] == 1
-    assert shown['deepsimbad_job_seconds_sum{kind="remap",state="succeeded"}'] > 0
-    assert shown['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
-    ended_at = shown['deepsimbad_last_remap_timestamp_seconds{domain="ready"}']
-    own.upload("ready", "backwards", ready_encodings()[:2], [1.0, 0.0])
-    assert own.remap("ready", training_traverse="backwards")["state"] == "failed"
-    shown = scraped(own)
-    outcomes = {name: value for name, value in shown.items() if name.startswith("deepsimbad_last_remap{")}
+def test_a_map_and_the_last_remap(own_client):
+    values = scraped(own_client)
+    assert values['deepsimbad_active_map_version{domain="ready"}'] == 1
+    assert values['deepsimbad_map_images{domain="ready"}'] == N_READY
+    bits = own_client.get("/v1/domains/ready").json()["index_bits_per_map_image"]
+    assert values['deepsimbad_map_index_bytes{domain="ready"}'] == pytest.approx(bits * N_READY / 8)
+    assert 0 <= values['deepsimbad_map_age_seconds{domain="ready"}'] < 3600
+    assert values['deepsimbad_map_damaged{domain="ready"}'] == 0
+    assert values["deepsimbad_domains"] == values["deepsimbad_loaded_maps"] == 1
+    assert (values['deepsimbad_jobs{state="succeeded"}'], values['deepsimbad_jobs{state="failed"}']) == (1, 0)
+    assert values['deepsimbad_job_seconds_count{kind="remap",state="succeeded"}'] == 1
+    assert values['deepsimbad_job_seconds_sum{kind="remap",state="succeeded"}'] > 0
+    assert values['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
+    ended_at = values['deepsimbad_last_remap_timestamp_seconds{domain="ready"}']
+    own_client.upload("ready", "backwards", ready_encodings()[:2], [1.0, 0.0])
+    assert own_client.remap("ready", training_traverse="backwards")["state"] == "failed"
+    values = scraped(own_client)
+    outcomes = {name: value for name, value in values.items() if name.startswith("deepsimbad_last_remap{")}
     failed = 'deepsimbad_last_remap{domain="ready",outcome="failed"}'
     assert (len(outcomes), [name for name, value in outcomes.items() if value]) == (4, [failed])
-    assert shown['deepsimbad_last_remap_timestamp_seconds{domain="ready"}'] > ended_at
-    assert shown['deepsimbad_job_seconds_count{kind="remap",state="failed"}'] == 1
-    assert shown['deepsimbad_active_map_version{domain="ready"}'] == 1
+    assert values['deepsimbad_last_remap_timestamp_seconds{domain="ready"}'] > ended_at
+    assert values['deepsimbad_job_seconds_count{kind="remap",state="failed"}'] == 1
+    assert values['deepsimbad_active_map_version{domain="ready"}'] == 1
 
 
-def test_sessions_disk_release_and_process(own, tmp_path):
-    own.begin()
-    shown = scraped(own)
-    assert shown["deepsimbad_sessions"] == 1
+def test_sessions_disk_release_and_process(own_client, tmp_path):
+    own_client.begin()
+    values = scraped(own_client)
+    assert values["deepsimbad_sessions"] == 1
     usage = shutil.disk_usage(tmp_path)
-    assert shown["deepsimbad_data_dir_size_bytes"] == usage.total
-    assert abs(shown["deepsimbad_data_dir_free_bytes"] - usage.free) < 1 << 30
-    assert [value for name, value in shown.items() if name.startswith("deepsimbad_build_info{")] == [1]
-    assert shown["process_resident_memory_bytes"] > 1e6
-    assert shown["process_open_fds"] > 3
-    assert not [name for name in shown if "_created" in name]
-    own.services.catalog._db.execute("DROP TABLE job")
-    shown = scraped(own)
-    assert "deepsimbad_sessions" in shown, "what can be read is shown"
-    assert "deepsimbad_domains" not in shown
+    assert values["deepsimbad_data_dir_size_bytes"] == usage.total
+    assert abs(values["deepsimbad_data_dir_free_bytes"] - usage.free) < 1 << 30
+    assert [value for name, value in values.items() if name.startswith("deepsimbad_build_info{")] == [1]
+    assert values["process_resident_memory_bytes"] > 1e6
+    assert values["process_open_fds"] > 3
+    assert not [name for name in values if "_created" in name]
+    own_client.services.catalog._db.execute("DROP TABLE job")
+    values = scraped(own_client)
+    assert "deepsimbad_sessions" in values, "what can be read is shown"
+    assert "deepsimbad_domains" not in values
 
 
 def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path):
@@ -96,11 +96,11 @@ def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path):
         maps._clock = lambda: 0.0
 
         def damaged():
-            shown = scraped(client)
+            values = scraped(client)
             ready = client.get("/readyz").json()
             assert ready["status"] == "ready"
-            version = shown['deepsimbad_active_map_version{domain="ready"}']
-            return version, shown['deepsimbad_map_damaged{domain="ready"}'], ready["damaged_maps"]
+            version = values['deepsimbad_active_map_version{domain="ready"}']
+            return version, values['deepsimbad_map_damaged{domain="ready"}'], ready["damaged_maps"]
 
         assert damaged() == (2, 1, ["ready"])
         assert 'deepsimbad_map_images{domain="ready"}' not in scraped(client)
@@ -129,16 +129,16 @@ def test_a_deleted_domain_takes_its_series_along(client, domain):
 def test_every_stage_is_told_and_counted(client, call):
     path = "/v1/domains/seen" if call == "localizations" else client.session("seen")
     names = {stage: f'deepsimbad_localization_stage_seconds_count{{stage="{stage}"}}' for stage in STAGES[call]}
-    before = scraped(client)
+    old_values = scraped(client)
     timings_ms = client.post(f"{path}/{call}", content=encoded(picture(1)), headers=JPEG).json()["timings_ms"]
     assert set(timings_ms) == STAGES[call]
     assert min(timings_ms.values()) >= 0
     total = timings_ms.pop("total")
     assert 0 < sum(timings_ms.values()) <= total + 0.001 * len(names)  # each is rounded
     assert min(timings_ms["decode"], timings_ms["describe"]) > 0
-    after = scraped(client)
-    counts = {name: value for name, value in after.items() if "stage_seconds_count" in name}
-    assert {name for name, value in counts.items() if value == before.get(name, 0) + 1} == set(names.values())
+    new_values = scraped(client)
+    counts = {name: value for name, value in new_values.items() if "stage_seconds_count" in name}
+    assert {name for name, value in counts.items() if value == old_values.get(name, 0) + 1} == set(names.values())
 
 
 def test_every_stage_is_explained_to_operators_and_no_other():

@@ -28,22 +28,22 @@ class Profile:
     async def of_an_observation(self, app):
         """Hear an observation of a session from its request to its answer."""
         async with httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://robot") as robot:
-            begun = await robot.post("/v1/domains/ready/sessions", json={})
-            path = f"/v1/sessions/{begun.json()['session_id']}/observations?action_m=2"
+            session = await robot.post("/v1/domains/ready/sessions", json={})
+            path = f"/v1/sessions/{session.json()['session_id']}/observations?action_m=2"
             for _ in range(3):
                 assert (await robot.post(path, json=RANKS)).status_code == 200
-            heard = []
+            functions = []
             for number in (4, 5, 6):  # what happens every second may happen beside one of them
-                before, self.is_on, self.called = sys.getprofile(), True, set()
+                old_profile, self.is_on, self.called = sys.getprofile(), True, set()
                 sys.setprofile(self)
                 try:
                     answer = await robot.post(path, json=RANKS)
                 finally:
                     self.is_on = False
-                    sys.setprofile(before)
+                    sys.setprofile(old_profile)
                 assert (answer.status_code, answer.json()["n_observations"]) == (200, number)
-                heard.append(self.called)
-            self.called = min(heard, key=len)
+                functions.append(self.called)
+            self.called = min(functions, key=len)
 
 
 def test_an_observation_passes_through_few_files_and_functions(tmp_path):

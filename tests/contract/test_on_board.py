@@ -37,7 +37,7 @@ BY_HAND = b"\x00\x03" + bytes([0b0111_0010, 0b1001_0000])
 def post(request, client):
     """Posts a view by either call."""
     path = READY if request.param == "localizations" else f"{client.session()}/observations"
-    return lambda **sent: client.post(path, **sent)
+    return lambda **view_request: client.post(path, **view_request)
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +62,8 @@ def test_the_landmark_model_is_an_npz_of_named_arrays(client):
     assert set(arrays.files) == {"prototypes", "usual", "map_version", "n_landmarks", "evaluator", "weights_sha256"}
     assert (arrays["prototypes"].shape, arrays["prototypes"].dtype) == ((N_LANDMARKS, DIM), np.float32)
     assert np.linalg.norm(arrays["prototypes"], axis=1) == pytest.approx(np.ones(N_LANDMARKS))
-    usual = np.stack([ready_encodings().mean(axis=0), ready_encodings().std(axis=0)])
-    assert (arrays["usual"].dtype, arrays["usual"]) == (np.float32, pytest.approx(usual, abs=1e-6))
+    statistics = np.stack([ready_encodings().mean(axis=0), ready_encodings().std(axis=0)])
+    assert (arrays["usual"].dtype, arrays["usual"]) == (np.float32, pytest.approx(statistics, abs=1e-6))
     assert arrays["map_version"].dtype == np.int64
     assert (int(arrays["map_version"]), int(arrays["n_landmarks"])) == (1, N_LANDMARKS)
     assert json.loads(str(arrays["evaluator"])) == TAKES_ENCODINGS["evaluator"]
@@ -78,15 +78,15 @@ def test_its_tag_is_the_digest_that_the_domain_tells(client):
     assert answer.headers["etag"] == f'"{digest}"'
     assert OnBoardEncoder(answer.content).digest == digest
     assert client.get("/v1/domains/unmapped").json()["landmark_model_digest"] is None
-    for known in (f'"{digest}"', f'W/"{digest}"', f'"other", "{digest}"', "*"):
-        unchanged = client.get(MODEL, headers={"If-None-Match": known})
+    for etag in (f'"{digest}"', f'W/"{digest}"', f'"other", "{digest}"', "*"):
+        unchanged = client.get(MODEL, headers={"If-None-Match": etag})
         assert (unchanged.status_code, unchanged.content) == (304, b"")
         assert unchanged.headers["etag"] == f'"{digest}"'
     assert client.get(MODEL, headers={"If-None-Match": '"other"'}).content == answer.content
 
 
 def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt):
-    latest, first = (rebuilt.get(MODEL, params=asked) for asked in ({}, {"map_version": 1}))
+    latest, first = (rebuilt.get(MODEL, params=params) for params in ({}, {"map_version": 1}))
     new, old = OnBoardEncoder(latest.content), OnBoardEncoder(first.content)
     assert (new.map_version, new.n_landmarks, old.map_version) == (2, 7, 1)
     assert latest.headers["etag"] != first.headers["etag"]
@@ -103,8 +103,8 @@ def test_ranks_by_hand(client):
     assert pack_ranked_landmarks([7, 2, 9], N_LANDMARKS) == BY_HAND
     packed = client.post(READY, content=BY_HAND, headers=PACKED)
     assert packed.status_code == 200, packed.text
-    written = client.post(READY, json={"ranked_landmarks": [7, 2, 9]})
-    assert packed.json() == {**written.json(), "timings_ms": packed.json()["timings_ms"]}
+    as_json = client.post(READY, json={"ranked_landmarks": [7, 2, 9]})
+    assert packed.json() == {**as_json.json(), "timings_ms": packed.json()["timings_ms"]}
 
 
 @pytest.mark.parametrize(
@@ -125,15 +125,15 @@ def test_a_unit_encoding_by_hand_is_answered_as_its_dissimilarities(client):
     packed = client.post(READY, content=by_hand, headers=PACKED_UNIT)
     assert packed.status_code == 200, packed.text
     landmarks = np.load(io.BytesIO(client.get(MODEL).content))["prototypes"].astype(np.float64)
-    apart = (2 - 2 * landmarks @ u / np.linalg.norm(u)).tolist()
-    compared = client.post(READY, json={"dissimilarities": apart}).json()
+    dissimilarities = (2 - 2 * landmarks @ u / np.linalg.norm(u)).tolist()
+    by_dissimilarities = client.post(READY, json={"dissimilarities": dissimilarities}).json()
     assert packed.json()["retrieval"] == [
-        {**place, "relevance": pytest.approx(place["relevance"], abs=1e-5)} for place in compared["retrieval"]
+        {**place, "relevance": pytest.approx(place["relevance"], abs=1e-5)} for place in by_dissimilarities["retrieval"]
     ]
-    nothing = client.post(
+    by_zeros = client.post(
         READY, content=bytes([3]) + bytes([0b011_011_01, 0b1_011_011_0, 0b11_011_011]), headers=PACKED_UNIT
     )
-    assert nothing.json()["informative"] is False
+    assert by_zeros.json()["informative"] is False
 
 
 @pytest.mark.parametrize("body", [b"\1", b"\3\0\0", b"\3\0\0\0\0", b"\3\xff\xff\xff", b"\x09" + bytes(9)])
@@ -149,10 +149,10 @@ def test_a_robot_with_other_landmarks_is_told(post, client):
         assert post(json={"ranked_landmarks": [7, 2]}, headers={"If-Match": matching}).status_code == 200
     for other in ('"other"', f'W/"{digest}"'):
         answer = post(content=BY_HAND, headers={**PACKED, "If-Match": other})
-        about = problem(answer, 409, "landmark_model_differs")
-        assert about["landmark_model_digest"] == digest
-        assert about["given_landmark_models"] == (["other"] if other == '"other"' else [])
-        assert about["map_version"] == 1
+        document = problem(answer, 409, "landmark_model_differs")
+        assert document["landmark_model_digest"] == digest
+        assert document["given_landmark_models"] == (["other"] if other == '"other"' else [])
+        assert document["map_version"] == 1
     for nonsense in (digest, "", '"', '"a" "b"'):
         problem(post(content=BY_HAND, headers={**PACKED, "If-Match": nonsense}), 422, "invalid_request")
 
@@ -166,7 +166,7 @@ def test_a_view_by_other_landmarks_moves_nothing_and_tells_no_relevances(client)
 
 
 def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_path):
-    """The same picture: decoded, encoded and ranked here, and there."""
+    """The same picture is decoded, encoded and ranked on board, and by the service."""
     client.put("/v1/admin/domains/ranked", json={"evaluator": {"kind": "feature_l2"}})
     client.upload_pictures("ranked", "drive")
     client.remap("ranked", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3, relevance="standardised")
@@ -174,26 +174,29 @@ def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_p
     encoder = robot.on_board("ranked")
     assert (encoder.map_version, encoder.n_landmarks) == (1, N_SEEN)
     path = tmp_path / "view.jpg"
-    with robot.session("ranked") as here, robot.session("ranked") as there:
+    with robot.session("ranked") as board_session, robot.session("ranked") as image_session:
         for number in (5, 3):
             path.write_bytes(encoded(picture(number)))
             ranked = encoder.ranks(path)
             assert len(ranked.body) <= 64
             on_board, by_image = robot.localize("ranked", on_board=ranked), robot.localize("ranked", path)
             assert (on_board.retrieval, on_board.belief) == (by_image.retrieval, by_image.belief)
-            assert here.observe(on_board=ranked).belief == there.observe(path).belief
+            assert board_session.observe(on_board=ranked).belief == image_session.observe(path).belief
         assert (robot.relevances("ranked", on_board=ranked) == robot.relevances("ranked", path)).all()
         dark = encoded(np.zeros((90, 120, 3), np.uint8))
-        assert here.observe(on_board=encoder.ranks(dark)).belief == there.observe(dark).belief
+        assert board_session.observe(on_board=encoder.ranks(dark)).belief == image_session.observe(dark).belief
 
 
 def test_a_few_bytes_find_the_place_on_a_map_that_compares_encodings(client):
     robot = Client(str(client.base_url), transport=client._transport)
     encoder = robot.on_board("seen")
     for number in (5, 3):
-        for seen in (encoder.view(encoded(picture(number))), encoder.ranks(encoded(picture(number)))):
-            assert robot.localize("seen", on_board=seen).retrieval[0].map_image == number
-            assert robot.localize_anywhere(on_board=seen, domains=["seen"]).domains[0].retrieval[0].map_image == number
+        for packed_view in (encoder.view(encoded(picture(number))), encoder.ranks(encoded(picture(number)))):
+            assert robot.localize("seen", on_board=packed_view).retrieval[0].map_image == number
+            assert (
+                robot.localize_anywhere(on_board=packed_view, domains=["seen"]).domains[0].retrieval[0].map_image
+                == number
+            )
     with robot.session("seen") as session:
         session.observe(on_board=encoder.view(encoded(picture(5))))
         assert session.observe(on_board=encoder.view(encoded(picture(5))), action_m=0.0).belief.top[0].map_image == 5
@@ -203,8 +206,8 @@ def test_a_map_that_compares_ranks_takes_no_unit_encoding(client):
     client.make_ready_domain("by_ranks")
     client.remap("by_ranks", landmark_traverse="drive", n_landmarks=N_LANDMARKS, relevance="rrf")
     path = "/v1/domains/by_ranks/localizations"
-    about = problem(client.post(path, content=b"\3\0\0\0", headers=PACKED_UNIT), 422, "invalid_encoding")
-    assert "send ranked landmarks" in about["detail"]
+    document = problem(client.post(path, content=b"\3\0\0\0", headers=PACKED_UNIT), 422, "invalid_encoding")
+    assert "send ranked landmarks" in document["detail"]
 
 
 def test_the_client_names_other_landmarks(client):

@@ -8,8 +8,8 @@ import signal
 import httpx2
 import pytest
 
-from .conftest import JPEG, of_one_process, until
-from .served import Served
+from .conftest import JPEG, of_one_process, wait_until
+from .server_process import ServerProcess
 
 MEBIBYTE = 1024 * 1024
 FRAME = "/v1/admin/domains/d/traverses/t/frames/0?position_m=0"
@@ -18,10 +18,10 @@ HEAD = f"PUT {FRAME} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: image/jpeg\r\n
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    with Served(tmp_path_factory.mktemp("wire") / "data") as served:
-        httpx2.put(f"{served.url}/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2"}})
-        httpx2.post(f"{served.url}/v1/admin/domains/d/traverses", json={"name": "t"})
-        yield served
+    with ServerProcess(tmp_path_factory.mktemp("wire") / "data") as process:
+        httpx2.put(f"{process.url}/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2"}})
+        httpx2.post(f"{process.url}/v1/admin/domains/d/traverses", json={"name": "t"})
+        yield process
 
 
 def test_a_declared_length_is_refused_before_a_byte_of_it(server):
@@ -31,7 +31,7 @@ def test_a_declared_length_is_refused_before_a_byte_of_it(server):
 
 
 def test_a_sender_who_reads_only_after_its_last_byte_still_gets_the_answer(server):
-    with server.within(100):
+    with server.limited(100):
         for content in (bytes(100 * MEBIBYTE), (bytes(65536) for _ in range(1600))):
             answer = httpx2.put(f"{server.url}{FRAME}", content=content, headers=JPEG)
             assert (answer.status_code, answer.json()["code"]) == (413, "body_too_large")
@@ -62,7 +62,7 @@ def test_a_head_is_answered_and_leaves_no_error_in_the_log(server):
 def test_a_sender_who_leaves_early_is_no_fault_of_ours_and_it_ends_well_when_asked(server):
     with server.connect() as connection:
         connection.sendall(HEAD + b"X-Request-ID: left\r\nContent-Length: 1000\r\n\r\nabc")
-    until(lambda: '"left"' in server.log_path.read_text())
+    wait_until(lambda: '"left"' in server.log_path.read_text())
     lines = [json.loads(line) for line in server.log_path.read_text().splitlines()]
     assert not [line for line in lines if "exception" in line]
     assert [line["status"] for line in lines if line.get("request_id") == "left"] == [499]

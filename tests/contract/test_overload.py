@@ -29,10 +29,10 @@ def is_healthy(client):
 
 @contextmanager
 def full_queue(busy):
-    """One task is done all the while and another waits, as many as may; afterwards both are done."""
-    worker, gate, begun = busy.services.worker, threading.Event(), threading.Event()
-    worker.submit(lambda: (begun.set(), gate.wait(60)))
-    assert begun.wait(60)
+    """Keep the worker busy and its queue, of one task, full inside the block."""
+    worker, gate, has_begun = busy.services.worker, threading.Event(), threading.Event()
+    worker.submit(lambda: (has_begun.set(), gate.wait(60)))
+    assert has_begun.wait(60)
     waiting = worker.submit(lambda: None)
     try:
         yield
@@ -69,15 +69,15 @@ async def n_default_threads():
 
 
 def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy):
-    gate, begun, portal = threading.Event(), threading.Semaphore(0), busy.portal
+    gate, n_begun, portal = threading.Event(), threading.Semaphore(0), busy.portal
     assert portal is not None
     holders = [
-        portal.start_task_soon(run_sync, lambda: (begun.release(), gate.wait(60)))
+        portal.start_task_soon(run_sync, lambda: (n_begun.release(), gate.wait(60)))
         for _ in range(portal.call(n_default_threads))
     ]
     try:
         for _ in holders:
-            assert begun.acquire(timeout=60)
+            assert n_begun.acquire(timeout=60)
         assert is_healthy(busy)
         assert busy.post(READY, json=RANKS).status_code == 200
     finally:

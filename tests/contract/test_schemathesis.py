@@ -19,7 +19,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
 from .conftest import N_SEEN, service
-from .served import Served
+from .server_process import ServerProcess
 
 pytestmark = pytest.mark.slow
 
@@ -120,19 +120,19 @@ def schemathesis(url, folder, key):
     options = [f"--checks={','.join(CHECKS)}", f"--phases={','.join(PHASES)}", f"--max-examples={EXAMPLES}"]
     options += [f"--exclude-path={ENDLESS}", "--no-shrink"]
     options += ["--continue-on-failure", "--request-timeout=30", "--report=json", f"--report-json-path={report}"]
-    ran = subprocess.run(
+    process = subprocess.run(
         [*command, f"{url}/openapi.json", *options], cwd=folder, capture_output=True, text=True, check=False
     )
-    assert report.exists(), ran.stdout + ran.stderr
-    told = json.loads(report.read_text())
-    assert (told["failures"], told["errors"], told["complete"]) == ([], [], True), ran.stdout
-    assert ran.returncode == 0, ran.stdout
-    tried = {name: phase["status"] for name, phase in told["phases"].items() if name in PHASES}
-    assert tried == dict.fromkeys(PHASES, "success")
+    assert report.exists(), process.stdout + process.stderr
+    results = json.loads(report.read_text())
+    assert (results["failures"], results["errors"], results["complete"]) == ([], [], True), process.stdout
+    assert process.returncode == 0, process.stdout
+    phase_statuses = {name: phase["status"] for name, phase in results["phases"].items() if name in PHASES}
+    assert phase_statuses == dict.fromkeys(PHASES, "success")
     n_operations = sum(len(by_method) for by_method in httpx2.get(f"{url}/openapi.json").json()["paths"].values())
-    assert told["operations"]["tested"] >= n_operations - 1
-    n_cases = told["test_cases"]["generated"]
-    print(f"{n_cases} cases, {n_operations} operations, {told['running_time']:.0f} s")
+    assert results["operations"]["tested"] >= n_operations - 1
+    n_cases = results["test_cases"]["generated"]
+    print(f"{n_cases} cases, {n_operations} operations, {results['running_time']:.0f} s")
     return n_cases
 
 
@@ -141,9 +141,9 @@ def test_a_service_with_keys(tmp_path):
     prepare(data_dir)
     with Catalog.open(data_dir) as catalog:
         _, admin = catalog.create_key(KeyScope.ADMIN)
-    with Served(data_dir, SERVE) as served:
-        assert schemathesis(served.url, tmp_path, admin.text) >= FEWEST_CASES
-        assert httpx2.get(f"{served.url}/readyz").status_code == 200
-        assert '"request failed"' not in served.log_path.read_text()
-        os.kill(served.pid, signal.SIGTERM)
-        assert served.wait(60) == 0, served.log_path.read_text()
+    with ServerProcess(data_dir, SERVE) as server:
+        assert schemathesis(server.url, tmp_path, admin.text) >= FEWEST_CASES
+        assert httpx2.get(f"{server.url}/readyz").status_code == 200
+        assert '"request failed"' not in server.log_path.read_text()
+        os.kill(server.pid, signal.SIGTERM)
+        assert server.wait(60) == 0, server.log_path.read_text()

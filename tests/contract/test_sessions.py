@@ -1,4 +1,4 @@
-"""`/v1/.../sessions`: the answers' shapes and truths, each thing once, and how they end."""
+"""`/v1/.../sessions`: what the answers hold, requests repeated under one key, and how sessions end."""
 
 import asyncio
 import io
@@ -27,7 +27,7 @@ from .conftest import (
     ready_encodings,
     service,
     small_settings,
-    until,
+    wait_until,
 )
 
 STATE = {"session_id", "domain", "map_version", "n_observations", "expires_at", "belief", "next_best_view"}
@@ -50,14 +50,14 @@ def test_long_answers_of_every_route_are_written_beside_the_loop(client, monkeyp
     monkeypatch.setattr(requests, "run_sync", counting)
     monkeypatch.setattr(requests, "LONG_LIST", 20)
     path = client.session()
-    asked = [
+    calls = [
         ("POST", "/v1/domains/ready/localizations", RANKS),
         ("POST", f"{path}/observations", RANKS),
         ("GET", path, None),
         ("GET", f"{path}/belief", None),
     ]
-    for shortlist, n_expected in ((20, 0), (21, 2 * len(asked))):  # rendered, and written as JSON
-        for method, url, body in asked:
+    for shortlist, n_expected in ((20, 0), (21, 2 * len(calls))):  # rendered, and written as JSON
+        for method, url, body in calls:
             answer = client.request(method, url, params={"shortlist": shortlist}, json=body)
             assert answer.status_code == 200, answer.text
             belief = answer.json() if url.endswith("/belief") else answer.json()["belief"]
@@ -76,37 +76,37 @@ def test_a_session_from_beginning_to_end(client):
     path = path_of(session)
     answer = client.post(f"{path}/observations", json=RANKS, params={"shortlist": 3})
     assert answer.status_code == 200, answer.text
-    seen = answer.json()
-    assert set(seen) == STATE | {"timings_ms", "retrieval", "informative", "warnings"}
-    assert seen["n_observations"] == 1
-    assert len(seen["retrieval"]) == len(seen["belief"]["top"]) == 3
-    relevance = [place["relevance"] for place in seen["retrieval"]]
+    first_answer = answer.json()
+    assert set(first_answer) == STATE | {"timings_ms", "retrieval", "informative", "warnings"}
+    assert first_answer["n_observations"] == 1
+    assert len(first_answer["retrieval"]) == len(first_answer["belief"]["top"]) == 3
+    relevance = [place["relevance"] for place in first_answer["retrieval"]]
     assert relevance == sorted(relevance, reverse=True)
-    assert set(seen["next_best_view"]) == {"planner", "action_m", "stop", "actions"}
+    assert set(first_answer["next_best_view"]) == {"planner", "action_m", "stop", "actions"}
 
-    moved = client.post(f"{path}/observations", json=RANKS, params={"action_m": 4, "action_std_m": 0.5}).json()
-    assert moved["n_observations"] == 2
+    second_answer = client.post(f"{path}/observations", json=RANKS, params={"action_m": 4, "action_std_m": 0.5}).json()
+    assert second_answer["n_observations"] == 2
     state = client.get(path).json()
     assert set(state) == STATE
-    assert state["belief"] == moved["belief"] == client.get(f"{path}/belief").json()
-    assert state["next_best_view"] == moved["next_best_view"] == client.get(f"{path}/next-best-view").json()
+    assert state["belief"] == second_answer["belief"] == client.get(f"{path}/belief").json()
+    assert state["next_best_view"] == second_answer["next_best_view"] == client.get(f"{path}/next-best-view").json()
     packed = client.get(f"{path}/belief", headers={"Accept": "application/octet-stream"})
     assert packed.headers["content-type"] == "application/octet-stream"
     mass = np.load(io.BytesIO(packed.content))
     assert (mass.dtype, mass.shape) == (np.float32, (N_READY,))
     assert mass.sum() == pytest.approx(1)
-    assert int(mass.argmax()) == moved["belief"]["top"][0]["map_image"]
+    assert int(mass.argmax()) == second_answer["belief"]["top"][0]["map_image"]
 
     prior = client.put(f"{path}/prior", json={"position_m": 30, "std_m": 2.5})
     assert prior.status_code == 200
     assert set(prior.json()) == STATE
     assert (prior.json()["belief"]["mode_m"], prior.json()["n_observations"]) == (30, 2)
-    beside = client.put(f"{path}/prior", json={"position_m": -2, "std_m": 1})
-    assert beside.json()["belief"]["mode_m"] == 0, "a little beside the route is allowed"
+    slack_prior = client.put(f"{path}/prior", json={"position_m": -2, "std_m": 1})
+    assert slack_prior.json()["belief"]["mode_m"] == 0, "a little beside the route is allowed"
 
     assert client.delete(path).status_code == 204
-    for gone in (client.get(path), client.delete(path), observe(client, path)):
-        assert problem(gone, 410, "ended_session")["ending"] == "deleted"
+    for late_answer in (client.get(path), client.delete(path), observe(client, path)):
+        assert problem(late_answer, 410, "ended_session")["ending"] == "deleted"
 
 
 def test_a_start_a_planner_and_a_filter_may_be_chosen(client):
@@ -120,27 +120,27 @@ def test_a_start_a_planner_and_a_filter_may_be_chosen(client):
 
 
 def test_every_form_of_a_view(client):
-    ready, seen = client.session(), client.session("seen")
+    ready_path, image_path = client.session(), client.session("seen")
     for place, body in enumerate(({"dissimilarities": RANKS["ranked_landmarks"]}, {"encoding": [0.5] * DIM}, RANKS)):
-        answer = client.post(f"{ready}/observations", json=body)
+        answer = client.post(f"{ready_path}/observations", json=body)
         assert answer.json()["n_observations"] == place + 1, answer.text
-    answer = client.post(f"{seen}/observations", content=encoded(picture(4)), headers=JPEG)
+    answer = client.post(f"{image_path}/observations", content=encoded(picture(4)), headers=JPEG)
     assert answer.json()["belief"]["mode_m"] == 4
 
 
 @pytest.mark.parametrize("belief", ["grid", "particle"])
 def test_a_picture_of_nothing_says_nothing(client, belief):
     path = client.session("seen", belief=belief)
-    before = client.post(f"{path}/observations", content=encoded(picture(4)), headers=JPEG).json()["belief"]
+    old_belief = client.post(f"{path}/observations", content=encoded(picture(4)), headers=JPEG).json()["belief"]
     for shade in (0, 90, 255):
         blank = encoded(np.full((120, 160, 3), shade, np.uint8))
         answer = client.post(f"{path}/observations", content=blank, headers=JPEG)
         assert answer.status_code == 200, answer.text
         assert answer.json()["informative"] is False
         assert answer.json()["warnings"][0] == "the view told nothing of the place"
-        after = answer.json()["belief"]
-        assert after["entropy_bits"] >= before["entropy_bits"] - 1e-9
-        assert after["mode_m"] == before["mode_m"]
+        new_belief = answer.json()["belief"]
+        assert new_belief["entropy_bits"] >= old_belief["entropy_bits"] - 1e-9
+        assert new_belief["mode_m"] == old_belief["mode_m"]
 
 
 def see(client, path, image, action_m=0.0, **query):
@@ -196,12 +196,12 @@ def test_a_robot_is_confident_when_it_knows_its_place_as_surely_as_it_asked_to(c
         assert state["next_best_view"]["stop"] is first["next_best_view"]["stop"]
         return first["belief"]
 
-    known = answer(None)
-    mass = sum(place["mass"] for place in known["top"] if abs(place["route_position_m"] - known["mode_m"]) <= 5)
-    sure = mass * (1 - known["off_route"])
-    assert 0.1 < sure < 0.9
-    assert not known["confident"]
-    assert [answer(sure + more)["confident"] for more in (-1e-6, 1e-6)] == [True, False]
+    summary = answer(None)
+    mass = sum(place["mass"] for place in summary["top"] if abs(place["route_position_m"] - summary["mode_m"]) <= 5)
+    near_mass = mass * (1 - summary["off_route"])
+    assert 0.1 < near_mass < 0.9
+    assert not summary["confident"]
+    assert [answer(near_mass + margin)["confident"] for margin in (-1e-6, 1e-6)] == [True, False]
 
 
 @pytest.mark.parametrize("belief", ["grid", "particle"])
@@ -235,12 +235,12 @@ def test_metres_may_be_given_a_price(client):
 
 def test_the_credible_set_is_the_smallest_one(client):
     belief = see(client, client.session(), 11, shortlist=N_READY)["belief"]
-    held = 0.0
+    mass = 0.0
     members = []
     for place in belief["top"]:
         members.append(place["route_position_m"])
-        held += place["mass"]
-        if held >= 0.95:
+        mass += place["mass"]
+        if mass >= 0.95:
             break
     pieces = []
     for position_m in sorted(members):
@@ -262,10 +262,14 @@ def test_an_idempotency_key_counts_once(client):
     answers = [observe(client, path, 1, **key).json() for _ in range(3)]
     assert [answer["n_observations"] for answer in answers] == [1, 1, 1]
     assert answers[0]["belief"] == answers[1]["belief"] == answers[2]["belief"]
-    others = ("action_m=2", RANKS), ("action_m=1&action_std_m=2", RANKS), ("action_m=1", {"ranked_landmarks": [1]})
-    for query, body in others:
-        other = client.post(f"{path}/observations?{query}", json=body, headers=key)
-        problem(other, 422, "idempotency_key_reused")
+    other_requests = (
+        ("action_m=2", RANKS),
+        ("action_m=1&action_std_m=2", RANKS),
+        ("action_m=1", {"ranked_landmarks": [1]}),
+    )
+    for query, body in other_requests:
+        refused = client.post(f"{path}/observations?{query}", json=body, headers=key)
+        problem(refused, 422, "idempotency_key_reused")
     assert observe(client, path).json()["n_observations"] == 2
     assert observe(client, path, 1, **key).json()["belief"] == answers[0]["belief"]
 
@@ -274,26 +278,26 @@ def test_a_session_begun_twice_under_one_key_is_one(client, domain):
     key = {"Idempotency-Key": "a-robot's-start"}
     body = {"seed": 3, "start_position_m": 20}
 
-    def begun(content, headers=key, of=domain):
+    def begin(content, headers=key, of=domain):
         return client.post(f"/v1/domains/{of}/sessions", json=content, headers=headers)
 
-    first, again = begun(body), begun(body)
-    assert (first.status_code, again.status_code) == (201, 201)
-    assert first.json() == again.json()
-    assert first.headers["location"] == again.headers["location"] == path_of(first.json())
-    assert begun({**body, "planner": None, "start_std_m": 5.0}).json() == first.json()  # the same, written out
+    first, repetition = begin(body), begin(body)
+    assert (first.status_code, repetition.status_code) == (201, 201)
+    assert first.json() == repetition.json()
+    assert first.headers["location"] == repetition.headers["location"] == path_of(first.json())
+    assert begin({**body, "planner": None, "start_std_m": 5.0}).json() == first.json()  # the same, written out
     assert len(client.get("/v1/admin/sessions", params={"domain": domain}).json()["sessions"]) == 1
 
-    problem(begun({"seed": 4}), 422, "idempotency_key_reused")
-    problem(begun({**body, "start_position_m": 1e9}), 422, "idempotency_key_reused")
-    others = [begun(body, {}), begun(body, {"Idempotency-Key": "another"}), begun(body, key, "ready")]
-    assert len({answer.json()["session_id"] for answer in (first, *others)}) == 4
+    problem(begin({"seed": 4}), 422, "idempotency_key_reused")
+    problem(begin({**body, "start_position_m": 1e9}), 422, "idempotency_key_reused")
+    other_answers = [begin(body, {}), begin(body, {"Idempotency-Key": "another"}), begin(body, key, "ready")]
+    assert len({answer.json()["session_id"] for answer in (first, *other_answers)}) == 4
 
     observe(client, path_of(first.json()))
-    late = begun(body)
+    late = begin(body)
     assert (late.status_code, late.json()["n_observations"]) == (201, 1)
     client.delete(path_of(first.json()))
-    problem(begun(body), 410, "ended_session")
+    problem(begin(body), 410, "ended_session")
 
 
 def test_a_start_repeated_at_once_is_one_session_and_views_at_once_are_all_answered(tmp_path):
@@ -307,11 +311,13 @@ def test_a_start_repeated_at_once_is_one_session_and_views_at_once_are_all_answe
             httpx2.AsyncClient(transport=httpx2.ASGITransport(app), base_url="http://service") as robot,
         ):
             key = {"Idempotency-Key": "together"}
-            begun = await asyncio.gather(*(robot.post("/v1/domains/d/sessions", json={}, headers=key) for _ in "12345"))
-            assert {answer.status_code for answer in begun} == {201}
-            (path,) = {path_of(answer.json()) for answer in begun}
-            seen = await asyncio.gather(*(robot.post(f"{path}/observations", json=RANKS) for _ in range(8)))
-            assert sorted(answer.json()["n_observations"] for answer in seen) == list(range(1, 9))
+            sessions = await asyncio.gather(
+                *(robot.post("/v1/domains/d/sessions", json={}, headers=key) for _ in "12345")
+            )
+            assert {answer.status_code for answer in sessions} == {201}
+            (path,) = {path_of(answer.json()) for answer in sessions}
+            answers = await asyncio.gather(*(robot.post(f"{path}/observations", json=RANKS) for _ in range(8)))
+            assert sorted(answer.json()["n_observations"] for answer in answers) == list(range(1, 9))
             assert (await robot.get(path)).json()["n_observations"] == 8
             assert len((await robot.get("/v1/admin/sessions")).json()["sessions"]) == 1
 
@@ -337,7 +343,7 @@ def test_limits_expiry_and_metrics(tmp_path):
         for outcome in ("accepted", "repeated", "invalid_move"):
             assert f'deepsimbad_observations_total{{outcome="{outcome}"}} 1.0' in text
         assert "deepsimbad_session_commit_writes_count" in text
-        until(lambda: "deepsimbad_sessions 0.0" in client.get("/metrics").text)
+        wait_until(lambda: "deepsimbad_sessions 0.0" in client.get("/metrics").text)
         assert problem(client.get(first), 410, "ended_session")["ending"] == "expired"
         client.begin()
 
@@ -349,22 +355,26 @@ def test_a_restart_and_a_retired_map(tmp_path):
         client.make_ready_domain("ready")
         session = client.post("/v1/domains/ready/sessions", **begin_under_key).json()
         path = path_of(session)
-        seen = observe(client, path, **key).json()
+        first_answer = observe(client, path, **key).json()
         client.remap("ready", landmark_traverse="drive", n_landmarks=N_LANDMARKS - 1)
         assert client.get("/v1/domains/ready").json()["map_version"] == 2
         assert observe(client, path).json()["map_version"] == 1
     with service(tmp_path) as client:
-        again = observe(client, path, **key).json()
-        assert {**again, "timings_ms": {}, "expires_at": ""} == {**seen, "timings_ms": {}, "expires_at": ""}
+        repetition = observe(client, path, **key).json()
+        assert {**repetition, "timings_ms": {}, "expires_at": ""} == {
+            **first_answer,
+            "timings_ms": {},
+            "expires_at": "",
+        }
         assert client.get(path).json()["n_observations"] == 2
-        begun = client.post("/v1/domains/ready/sessions", **begin_under_key)
-        assert (begun.status_code, begun.json()["session_id"]) == (201, session["session_id"])
+        answer = client.post("/v1/domains/ready/sessions", **begin_under_key)
+        assert (answer.status_code, answer.json()["session_id"]) == (201, session["session_id"])
     (tmp_path / "domains" / "ready" / "maps" / "000001.sqlite").unlink()
     with service(tmp_path) as client:
         if not IS_FLEET:  # which has another of the file
-            about = problem(observe(client, path), 410, "retired_map")
-            assert "begin a new session" in about["detail"]
-            assert about["map_version"] == 1
+            document = problem(observe(client, path), 410, "retired_map")
+            assert "begin a new session" in document["detail"]
+            assert document["map_version"] == 1
         assert client.delete(path).status_code == 204
         path = client.session()
         assert client.delete("/v1/admin/domains/ready").status_code == 204
@@ -395,18 +405,18 @@ def test_a_robot_that_goes_backward_is_followed(client, back_and_forth, belief):
     see(client, path, image)
     for action_m in (10, -6, -6, 0, -0.4, -12, 2):
         image = round(image + action_m / 2) % N_READY
-        known = see(client, path, image, action_m)["belief"]
-        assert (known["mode_m"], known["off_route"] < 0.1) == (2 * image, True), action_m
+        position = see(client, path, image, action_m)["belief"]
+        assert (position["mode_m"], position["off_route"] < 0.1) == (2 * image, True), action_m
     for action_m in ("-100.5", "100.5", "nan"):
         refused = problem(observe(client, path, action_m), 422, "invalid_move")
         assert (refused["minimum"], refused["maximum"]) == (-100, 100)
     path = client.session(name, start_position_m=10, start_std_m=0.5, belief=belief)
     see(client, path, 5)
-    beyond = observe(client, path, -50)
+    far_move = observe(client, path, -50)
     if closed:
-        assert beyond.status_code == 200, beyond.text
+        assert far_move.status_code == 200, far_move.text
     else:
-        refused = problem(beyond, 422, "past_the_end")
+        refused = problem(far_move, 422, "past_the_end")
         assert (refused["route_end_m"], "the route begins at 0 m" in refused["detail"]) == (0, True)
 
 

@@ -1,4 +1,4 @@
-"""Where a session truly was: how good its answers were (`truths`), what the next map learns of it (`experience`)."""
+"""True positions of a session: how good its answers were (`truths`), and what the next map learns (`experience`)."""
 
 import re
 
@@ -41,16 +41,16 @@ class Walk:
             mass = {place["map_image"]: place["mass"] for place in document["belief"]["top"]}
             self.shares.append(rank(mass, [2 * view]) / N_READY)
 
-    def told(self, positions_m, **more):
-        answer = self._client.post(f"{self.path}/truths", json={"true_positions_m": positions_m, **more})
+    def post_truths(self, positions_m, **options):
+        answer = self._client.post(f"{self.path}/truths", json={"true_positions_m": positions_m, **options})
         assert answer.status_code == 200, answer.text
         return answer.json()
 
-    def counted(self):
-        """How many observations the metric has counted, and their ranks' sum in percent."""
+    def metric(self):
+        """The live ANR metric of the domain: the number of observations, and the sum of their ranks in percent."""
         pattern = rf'^deepsimbad_live_anr_percent_(count|sum)\{{domain="{self._domain}"\}} (\S+)$'
-        shown = dict(re.findall(pattern, self._client.get("/metrics").text, re.MULTILINE))
-        return int(float(shown.get("count", 0))), float(shown.get("sum", 0))
+        values = dict(re.findall(pattern, self._client.get("/metrics").text, re.MULTILINE))
+        return int(float(values.get("count", 0))), float(values.get("sum", 0))
 
     def learn(self, positions_m=None, domain=None):
         body = {"session_id": self.session_id, "true_positions_m": positions_m or self.positions_m}
@@ -58,7 +58,7 @@ class Walk:
 
 
 def rank(scores, true_images):
-    """Images above the best true one, and half of those beside it."""
+    """The number of images with higher scores than the best true one, and half of those tied with it."""
     best = max(scores[image] for image in true_images)
     return sum(score > best for score in scores.values()) + (list(scores.values()).count(best) - 1) / 2
 
@@ -68,15 +68,15 @@ def test_the_answer_is_the_anr_of_the_beliefs_that_were_answered(client, domain)
     assert len(set(walk.shares)) > 1, "else nothing is shown"
     shares = walk.shares
     expected = pytest.approx(100 * float(np.mean(shares)))
-    assert walk.told(walk.positions_m) == {"n_scored": 5, "n_left_out": 0, "anr": expected, **NO_RANKS}
-    assert walk.counted() == (5, pytest.approx(100 * sum(shares)))
-    some = walk.told([None, *walk.positions_m[1:3], None, None])
-    assert some == {"n_scored": 2, "n_left_out": 3, "anr": pytest.approx(50 * sum(shares[1:3])), **NO_RANKS}
-    assert walk.told([None] * 5) == {"n_scored": 0, "n_left_out": 5, "anr": None, **NO_RANKS}
+    assert walk.post_truths(walk.positions_m) == {"n_scored": 5, "n_left_out": 0, "anr": expected, **NO_RANKS}
+    assert walk.metric() == (5, pytest.approx(100 * sum(shares)))
+    part = walk.post_truths([None, *walk.positions_m[1:3], None, None])
+    assert part == {"n_scored": 2, "n_left_out": 3, "anr": pytest.approx(50 * sum(shares[1:3])), **NO_RANKS}
+    assert walk.post_truths([None] * 5) == {"n_scored": 0, "n_left_out": 5, "anr": None, **NO_RANKS}
 
 
 def test_each_view_is_ranked_by_the_map_images_told(client, domain):
-    """Bit by bit as at once, by ANR's rule, also after the session went on or ended."""
+    """Ranks follow ANR's rule, in pieces or all at once, also after the session went on or ended."""
     walk = Walk(client, domain, 6)
     images = [[2 * view, 2 * view + 1] if view != 1 else [] for view in range(6)]
     expected = [rank(walk.retrievals[view], images[view]) if images[view] else None for view in range(6)]
@@ -84,7 +84,7 @@ def test_each_view_is_ranked_by_the_map_images_told(client, domain):
 
     def ranks(first, last):
         unknown = [None] * (last - first)
-        answer = walk.told(unknown, true_map_images=images[first:last], first_observation=first)
+        answer = walk.post_truths(unknown, true_map_images=images[first:last], first_observation=first)
         assert answer["n_left_out"] == last - first
         return answer["retrieval_ranks"]
 
@@ -97,29 +97,29 @@ def test_each_view_is_ranked_by_the_map_images_told(client, domain):
     assert ranks(6, 7) == [0]
     client.delete(walk.path)
     assert ranks(2, 7) == [*expected[2:], 0]
-    assert walk.counted()[0] == 0, "the alarm is of positions alone"
+    assert walk.metric()[0] == 0, "the alarm is of positions alone"
 
 
 def test_a_truth_far_from_the_map_says_nothing_of_it(client, domain):
     walk = Walk(client, domain, 3)
     last_m = 2.0 * (N_READY - 1)
-    answer = walk.told([walk.positions_m[0], 1e9, last_m + 10.5])
+    answer = walk.post_truths([walk.positions_m[0], 1e9, last_m + 10.5])
     assert answer == {"n_scored": 1, "n_left_out": 2, "anr": pytest.approx(100 * walk.shares[0]), **NO_RANKS}
-    assert walk.counted()[0] == 1
-    assert walk.told([None, None, last_m + 9.5])["n_scored"] == 1
+    assert walk.metric()[0] == 1
+    assert walk.post_truths([None, None, last_m + 9.5])["n_scored"] == 1
 
 
 def test_an_observation_is_counted_once_whoever_tells(client, domain, monkeypatch):
     walk = Walk(client, domain)
     for _ in range(2):
-        walk.told([*walk.positions_m[:3], None, None])
-        assert walk.counted() == (3, pytest.approx(100 * sum(walk.shares[:3])))
+        walk.post_truths([*walk.positions_m[:3], None, None])
+        assert walk.metric() == (3, pytest.approx(100 * sum(walk.shares[:3])))
     for positions_m in (walk.positions_m, [None] * 5, walk.positions_m):
-        walk.told(positions_m)
-        assert walk.counted() == (5, pytest.approx(100 * sum(walk.shares)))
+        walk.post_truths(positions_m)
+        assert walk.metric() == (5, pytest.approx(100 * sum(walk.shares)))
     client.post(f"{walk.path}/observations", json={"ranked_landmarks": [1]})
-    walk.told([*walk.positions_m, 16.0])
-    assert walk.counted()[0] == 6
+    walk.post_truths([*walk.positions_m, 16.0])
+    assert walk.metric()[0] == 6
     assert client.get(walk.path).json()["n_observations"] == 6, "telling moves nothing"
 
     def refuse(*_):
@@ -131,14 +131,14 @@ def test_an_observation_is_counted_once_whoever_tells(client, domain, monkeypatc
         problem(walk.learn(), 503, "unavailable")
     client.delete(walk.path)
     jobs = [walk.learn().json() for _ in range(2)]
-    walk.told(walk.positions_m)
-    assert walk.counted()[0] == 11
+    walk.post_truths(walk.positions_m)
+    assert walk.metric()[0] == 11
     assert [client.wait_for(job["job_id"])["state"] for job in jobs] == ["succeeded"] * 2
 
 
 def test_a_deleted_domain_takes_its_series_along(client, domain):
     walk = Walk(client, domain)
-    walk.told(walk.positions_m)
+    walk.post_truths(walk.positions_m)
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
     assert f'domain="{domain}"' not in client.get("/metrics").text
     answer = client.post(f"{walk.path}/truths", json={"true_positions_m": walk.positions_m})
@@ -164,7 +164,7 @@ def test_truths_that_cannot_be(client):
             problem(client.post(f"{walk.path}/truths", content=body, headers=JSON), 422, code)
     answer = client.post(f"{walk.path}/truths", content="x", headers={"Content-Type": "text/plain"})
     problem(answer, 415, "unsupported_media_type")
-    assert walk.counted()[0] == 0
+    assert walk.metric()[0] == 0
 
 
 # Experience
@@ -180,26 +180,28 @@ def test_the_next_map_learns_from_a_session(client, domain):
     job = client.wait_for(answer.json()["job_id"])
     assert (job["state"], job["kind"], job["result"]["map_version"]) == ("succeeded", "experience", 2)
     assert job["result"]["metrics"]["experience"] == {"from_version": 1, "n_walks": 1, "n_moves": 4}
-    before, after = (load_snapshot(client.services.catalog, domain, version).q_values for version in (1, 2))
-    assert before is not None
-    step = np.ptp(after) / 65535  # of numbers packed into two bytes, which is another where their range is
-    changed = np.flatnonzero((np.abs(before - after) > 2 * step).any(axis=0))
-    assert changed.tolist() == [3]  # the move of 4 m alone
+    old_q_values, new_q_values = (
+        load_snapshot(client.services.catalog, domain, version).q_values for version in (1, 2)
+    )
+    assert old_q_values is not None
+    step = np.ptp(new_q_values) / 65535  # of numbers packed into two bytes, which is another where their range is
+    actions = np.flatnonzero((np.abs(old_q_values - new_q_values) > 2 * step).any(axis=0))
+    assert actions.tolist() == [3]  # the move of 4 m alone
     assert client.get(walk.path).json()["map_version"] == 1
     # A session on the older version may be fed back too: its landmarks are the same. A prior begins another walk.
     client.put(f"{walk.path}/prior", json={"position_m": 8, "std_m": 1})
     for _ in range(2):
         client.post(f"{walk.path}/observations", json={"ranked_landmarks": [1, 2, 3]})
     client.delete(walk.path)  # and an ended one as well
-    again = client.wait_for(walk.learn([*walk.positions_m, 8.0, 8.0]).json()["job_id"])["result"]
-    assert (again["map_version"], again["metrics"]["experience"]["n_walks"]) == (3, 2)
+    result = client.wait_for(walk.learn([*walk.positions_m, 8.0, 8.0]).json()["job_id"])["result"]
+    assert (result["map_version"], result["metrics"]["experience"]["n_walks"]) == (3, 2)
 
 
 def test_a_session_whose_map_is_gone_or_differs(client, domain, data_dir):
     walk = Walk(client, domain, 3)
     maps = f"/v1/admin/domains/{domain}/maps"
     client.remap(domain, **ANEW, n_landmarks=N_LANDMARKS - 1)
-    answer = walk.told(walk.positions_m)  # the season has turned, the session's own map still tells
+    answer = walk.post_truths(walk.positions_m)  # the season has turned, the session's own map still tells
     assert (answer["map_version"], answer["anr"]) == (1, pytest.approx(100 * float(np.mean(walk.shares))))
     problem(walk.learn(), 409, "conflict")
     client.remap(domain, **ANEW, n_landmarks=N_LANDMARKS)

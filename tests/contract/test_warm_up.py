@@ -36,19 +36,19 @@ with service(Path(sys.argv[1])) as client:
 
 
 def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path):
-    """Of a map that learnt from two seasons, as a map by default does."""
+    """The map has learnt from two seasons, so that all default kernels run."""
     random = np.random.default_rng(3)
     places = random.normal(size=(80, DIM))
     with service(tmp_path) as client:
         client.put("/v1/admin/domains/ready", json=TAKES_ENCODINGS)
         for season in ("summer", "winter"):
-            seen = (places + 0.1 * random.normal(size=places.shape)).astype(np.float32)
-            client.upload("ready", season, seen, np.arange(80.0))
+            encodings = (places + 0.1 * random.normal(size=places.shape)).astype(np.float32)
+            client.upload("ready", season, encodings, np.arange(80.0))
         drives = {"training_traverse": "summer", "landmark_traverse": "winter", "same_route": True, "n_landmarks": 40}
         job = client.remap("ready", **drives, training_episodes=20)
         assert job["result"]["metrics"]["second_season"]["accepted"], job
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)], capture_output=True, text=True, check=True
     )
-    answers = json.loads(done.stdout)
+    answers = json.loads(process.stdout)
     assert (set(answers["statuses"]), answers["late"]) == ({200}, [])

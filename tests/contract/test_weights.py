@@ -10,7 +10,18 @@ import pytest
 from deepsimbad.engine import worker
 from deepsimbad.errors import InvalidWeightsError
 
-from .conftest import JPEG, N_SEEN, RANKS, TAKES_ENCODINGS, encoded, of_one_process, picture, problem, service, until
+from .conftest import (
+    JPEG,
+    N_SEEN,
+    RANKS,
+    TAKES_ENCODINGS,
+    encoded,
+    of_one_process,
+    picture,
+    problem,
+    service,
+    wait_until,
+)
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "onnx:eyes.onnx"}
 DOMAIN = "/v1/admin/domains/street"
@@ -19,11 +30,11 @@ DRIVES = {"training_traverse": "drive", "landmark_traverse": "drive", "n_landmar
 
 
 def write_network(path, seed):
-    """The means of the three channels and of four parts of the image, mixed at random; its digest."""
+    """Write a network that mixes the mean colours of four parts of an image at random; the file's SHA-256 in hex."""
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     helper = onnx.helper
-    mixed = np.random.default_rng(seed).normal(size=(12, 16)).astype(np.float32)
+    weights = np.random.default_rng(seed).normal(size=(12, 16)).astype(np.float32)
     graph = helper.make_graph(
         [
             helper.make_node("AveragePool", ["x"], ["parts"], kernel_shape=[16, 16], strides=[16, 16]),
@@ -33,7 +44,7 @@ def write_network(path, seed):
         "eyes",
         [helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["n", 3, 32, 32])],
         [helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, ["n", 16])],
-        [onnx.numpy_helper.from_array(mixed, "mixed")],
+        [onnx.numpy_helper.from_array(weights, "mixed")],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +57,7 @@ def running(folder):
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def mapped_dir(tmp_path_factory):
     """A domain mapped by weights of its own, beside one that needs none."""
     folder = tmp_path_factory.mktemp("mapped")
     digest = write_network(folder / "weights" / "eyes.onnx", 1)
@@ -61,9 +72,9 @@ def mapped(tmp_path_factory):
 
 
 @pytest.fixture
-def weights(mapped, tmp_path):
+def weights(mapped_dir, tmp_path):
     """The file of the weights, in the test's own copy."""
-    shutil.copytree(mapped, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(mapped_dir, tmp_path, dirs_exist_ok=True)
     return tmp_path / "weights" / "eyes.onnx"
 
 
@@ -76,8 +87,8 @@ def test_views_and_frames_of_other_weights_are_refused_with_both_digests(tmp_pat
     second = write_network(weights, 2)
     with running(tmp_path) as client:
         for path in (VIEW, f"{client.session('street')}/observations"):
-            about = problem(view(client, path), 409, "weights_differ")
-            assert (about["known_weights_sha256"], about["given_weights_sha256"]) == (first, second)
+            document = problem(view(client, path), 409, "weights_differ")
+            assert (document["known_weights_sha256"], document["given_weights_sha256"]) == (first, second)
         assert client.post(VIEW, json=RANKS).status_code == 200  # the map itself is as good as before
         assert set(client.upload_pictures("street", "drive")) == {409}
         assert set(client.upload_pictures("street", "again")) == {201}
@@ -101,9 +112,9 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path, 
     with running(tmp_path) as client:
         path = f"{client.session('street')}/observations"
         for url in (VIEW, path):
-            about = problem(view(client, url), 503, "evaluator_unavailable")
-            assert "eyes.onnx" in about["detail"]
-            assert about["reason"] == "missing_weights"
+            document = problem(view(client, url), 503, "evaluator_unavailable")
+            assert "eyes.onnx" in document["detail"]
+            assert document["reason"] == "missing_weights"
             assert client.post(url, json=RANKS).status_code == 200  # which needs no network
         assert client.get("/v1/domains/street").json()["evaluator_problem"] == "missing_weights"
         assert len(client.get("/v1/domains").json()["domains"]) == 2
@@ -112,7 +123,7 @@ def test_a_domain_whose_weights_are_gone_says_so_and_the_others_go_on(tmp_path, 
         weights.write_bytes(body)  # brought back, without a restart
         problem(view(client), 503, "evaluator_unavailable")
         monkeypatch.setattr(worker, "RETRY_AFTER_S", 0.0)  # later
-        until(lambda: view(client).status_code == 200)
+        wait_until(lambda: view(client).status_code == 200)
 
 
 def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path):
@@ -130,8 +141,8 @@ def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path):
             if content is not None:
                 (tmp_path / "weights" / name).write_bytes(content)
             answer = client.put(DOMAIN, json={"evaluator": {"kind": "feature_l2", "extractor": extractor}})
-            about = problem(answer, 422, code)
-            assert name.split("/")[-1].split(":")[0] in about["detail"] or about["allowed"]
+            document = problem(answer, 422, code)
+            assert name.split("/")[-1].split(":")[0] in document["detail"] or document["allowed"]
             assert client.get("/v1/domains/street").status_code == 404
 
 

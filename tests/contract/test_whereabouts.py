@@ -14,12 +14,12 @@ URL = "/v1/localizations"
 FAR = 30.0  # how differently the other route looks
 
 
-def asked(client, body, domains=None, **params):
+def answer_of(client, body, domains=None, **params):
     answer = client.post(URL, params=params, json={**body, **({} if domains is None else {"domains": domains})})
     assert answer.status_code == 200, answer.text
     document = answer.json()
-    told = sum(domain["probability"] for domain in document["domains"])
-    assert told + document["others"]["probability"] + document["elsewhere"] == pytest.approx(1)
+    likely_probability = sum(domain["probability"] for domain in document["domains"])
+    assert likely_probability + document["others"]["probability"] + document["elsewhere"] == pytest.approx(1)
     assert document["n_left_out"] >= len(document["left_out"])
     return document
 
@@ -51,20 +51,20 @@ def view_of(client, name, at):
 def test_a_view_is_of_the_domain_that_it_comes_from_and_where_that_says(routes):
     for name in ("a", "b", "far"):
         for at in (7, 21, 44):
-            answer = asked(routes, view_of(routes, name, at))
+            answer = answer_of(routes, view_of(routes, name, at))
             best = answer["domains"][0]
             assert (best["domain"], best["map_version"]) == (name, 1)
             assert best["probability"] > 0.5
             assert best["log_evidence"] > 0
             assert answer["top"][0]["domain"] == name
-            alone = routes.post(f"/v1/domains/{name}/localizations", json=view_of(routes, name, at)).json()
+            own_answer = routes.post(f"/v1/domains/{name}/localizations", json=view_of(routes, name, at)).json()
             for member in ("belief", "retrieval", "informative", "next_best_view"):
-                assert best[member] == alone[member], member
+                assert best[member] == own_answer[member], member
             masses = [place["mass"] for place in answer["top"]]
             assert masses == sorted(masses, reverse=True)
             first = best["belief"]["top"][0]
             assert answer["top"][0] == {**first, "domain": name, "mass": first["mass"] * best["probability"]}
-            assert {each["domain"]: each["code"] for each in answer["left_out"]} == {
+            assert {entry["domain"]: entry["code"] for entry in answer["left_out"]} == {
                 "long": "invalid_encoding",
                 "unmapped": "no_active_map",
             }
@@ -73,36 +73,36 @@ def test_a_view_is_of_the_domain_that_it_comes_from_and_where_that_says(routes):
 
 def test_one_domain_named_answers_as_its_own_call(routes):
     view = view_of(routes, "a", 12)
-    answer = asked(routes, view, ["a"], shortlist=4)
-    alone = routes.post("/v1/domains/a/localizations", params={"shortlist": 4}, json=view).json()
+    answer = answer_of(routes, view, ["a"], shortlist=4)
+    own_answer = routes.post("/v1/domains/a/localizations", params={"shortlist": 4}, json=view).json()
     (best,) = answer["domains"]
-    assert {**alone, "timings_ms": None} == {
+    assert {**own_answer, "timings_ms": None} == {
         "timings_ms": None,
         "warnings": [],
-        **{member: best[member] for member in alone if member not in {"timings_ms", "warnings"}},
+        **{member: best[member] for member in own_answer if member not in {"timings_ms", "warnings"}},
     }
     assert (answer["others"], answer["n_left_out"]) == ({"n_domains": 0, "probability": 0.0}, 0)
-    (probability,), elsewhere = posterior({"a": best["log_evidence"]})[0].values(), answer["elsewhere"]
-    assert (best["probability"], elsewhere) == pytest.approx((probability, 1 - probability))
+    (probability,), elsewhere_probability = posterior({"a": best["log_evidence"]})[0].values(), answer["elsewhere"]
+    assert (best["probability"], elsewhere_probability) == pytest.approx((probability, 1 - probability))
 
 
 def test_probabilities_are_those_of_the_plain_formula_over_each_domain(routes):
     view = view_of(routes, "b", 30)
-    each = {name: asked(routes, view, [name])["domains"][0]["log_evidence"] for name in ("a", "b", "far")}
-    probabilities, elsewhere = posterior(each)
-    answer = asked(routes, view, ["far", "a", "b", "a"])
+    log_evidences = {name: answer_of(routes, view, [name])["domains"][0]["log_evidence"] for name in ("a", "b", "far")}
+    probabilities, elsewhere_probability = posterior(log_evidences)
+    answer = answer_of(routes, view, ["far", "a", "b", "a"])
     assert {domain["domain"]: domain["probability"] for domain in answer["domains"]} == pytest.approx(
         probabilities, abs=1e-6
     )
-    assert answer["elsewhere"] == pytest.approx(elsewhere, abs=1e-6)
-    few = asked(routes, view, ["far", "a", "b"], in_full=1)
-    assert [domain["domain"] for domain in few["domains"]] == ["b"]
-    assert few["others"]["n_domains"] == 2
-    assert few["others"]["probability"] == pytest.approx(probabilities["a"] + probabilities["far"], abs=1e-6)
+    assert answer["elsewhere"] == pytest.approx(elsewhere_probability, abs=1e-6)
+    short_answer = answer_of(routes, view, ["far", "a", "b"], in_full=1)
+    assert [domain["domain"] for domain in short_answer["domains"]] == ["b"]
+    assert short_answer["others"]["n_domains"] == 2
+    assert short_answer["others"]["probability"] == pytest.approx(probabilities["a"] + probabilities["far"], abs=1e-6)
 
 
 def test_a_view_of_none_of_the_routes_is_elsewhere(routes):
-    answer = asked(routes, {"encoding": (np.full(32, -2 * FAR)).tolist()}, ["a", "b"])
+    answer = answer_of(routes, {"encoding": (np.full(32, -2 * FAR)).tolist()}, ["a", "b"])
     assert answer["elsewhere"] > 0.5
     assert answer["informative"] is False
     assert any("none of these routes" in warning for warning in answer["warnings"])
@@ -110,11 +110,11 @@ def test_a_view_of_none_of_the_routes_is_elsewhere(routes):
 
 def test_domains_are_named_in_the_body_or_beside_it(routes):
     view = view_of(routes, "a", 3)
-    in_body, beside = asked(routes, view, ["a", "b"]), asked(routes, view, domains=["a", "b"])
-    everywhere = [asked(routes, view), asked(routes, view, "*"), asked(routes, view, domains="*")]
-    for one, other in ((in_body, beside), *((everywhere[0], other) for other in everywhere[1:])):
-        assert {**one, "timings_ms": 0} == {**other, "timings_ms": 0}
-    assert next(domain["domain"] for domain in everywhere[0]["domains"]) == "a"
+    in_body, in_query = answer_of(routes, view, ["a", "b"]), answer_of(routes, view, domains=["a", "b"])
+    answers = [answer_of(routes, view), answer_of(routes, view, "*"), answer_of(routes, view, domains="*")]
+    for answer, other in ((in_body, in_query), *((answers[0], other) for other in answers[1:])):
+        assert {**answer, "timings_ms": 0} == {**other, "timings_ms": 0}
+    assert next(domain["domain"] for domain in answers[0]["domains"]) == "a"
     twice = routes.post(URL, params={"domains": "a"}, json={**view, "domains": ["b"]})
     problem(twice, 422, "invalid_request")
 
@@ -131,7 +131,7 @@ def test_who_cannot_be_asked_is_named(routes):
     problem(routes.post(URL, json={**view, "domains": ["unmapped"]}), 409, "no_active_map")
     problem(routes.post(URL, json={**view, "domains": ["long"]}), 422, "invalid_encoding")
     nobody = problem(routes.post(URL, json={**view, "domains": ["long", "unmapped"]}), 409, "no_domain_answers")
-    assert [each["domain"] for each in nobody["left_out"]] == ["long", "unmapped"]
+    assert [entry["domain"] for entry in nobody["left_out"]] == ["long", "unmapped"]
     problem(routes.post(URL, json={"domains": ["a"]}), 422, "invalid_request")
     problem(routes.post(URL, content=b"", headers=JSON), 422, "empty_body")
     problem(routes.post(URL, json={**view, "domains": ["a"]}, params={"in_full": 0}), 422, "invalid_request")
@@ -141,46 +141,46 @@ def test_who_cannot_be_asked_is_named(routes):
 def test_ranks_are_of_one_landmark_model(routes):
     ranks = {"ranked_landmarks": list(range(30))}
     problem(routes.post(URL, json={**ranks, "domains": ["a", "b"]}), 409, "landmark_model_differs")
-    assert [domain["domain"] for domain in asked(routes, ranks, ["b"])["domains"]] == ["b"]
+    assert [domain["domain"] for domain in answer_of(routes, ranks, ["b"])["domains"]] == ["b"]
     digest = routes.get("/v1/domains/a").json()["landmark_model_digest"]
     answer = routes.post(URL, json=ranks, headers={"If-Match": f'"{digest}"'}).json()
     assert [domain["domain"] for domain in answer["domains"]] == ["a"]
-    assert {each["domain"]: each["code"] for each in answer["left_out"]}["b"] == "landmark_model_differs"
+    assert {entry["domain"]: entry["code"] for entry in answer["left_out"]}["b"] == "landmark_model_differs"
 
 
 def test_a_remap_a_deletion_and_damage_are_seen_at_the_next_call(routes):
     view = view_of(routes, "a", 5)
     for name in ("gone", "hurt", "new"):
         make_domain(routes, name, routes.encodings["a"].astype(np.float32), n_landmarks=30)
-    asked(routes, view, in_full=100)
+    answer_of(routes, view, in_full=100)
     assert routes.delete("/v1/admin/domains/gone").status_code == 204
     assert routes.remap("new", landmark_traverse="drive", n_landmarks=20)["state"] == "succeeded"
     routes.services.catalog.map_path("hurt", 1).unlink()
-    asked(routes, view, ["a"])
+    answer_of(routes, view, ["a"])
     gc.collect()  # nobody holds the others now
     routes.services.maps.forget("hurt")
-    answer = asked(routes, view, in_full=100)
+    answer = answer_of(routes, view, in_full=100)
     assert {domain["domain"]: domain["map_version"] for domain in answer["domains"]} == {
         "a": 1,
         "b": 1,
         "far": 1,
         "new": 2,
     }
-    assert {each["domain"]: each["code"] for each in answer["left_out"]}["hurt"] == "damaged_map"
+    assert {entry["domain"]: entry["code"] for entry in answer["left_out"]}["hurt"] == "damaged_map"
     for name in ("hurt", "new"):
         routes.delete(f"/v1/admin/domains/{name}")
 
 
 def test_a_relevance_that_compares_with_no_other_is_left_out(routes):
     make_domain(routes, "paper", routes.encodings["a"].astype(np.float32), n_landmarks=30, relevance="rrf")
-    answer = asked(routes, view_of(routes, "a", 5), ["a", "paper"])
-    assert [each["domain"] for each in answer["left_out"]] == ["paper"]
+    answer = answer_of(routes, view_of(routes, "a", 5), ["a", "paper"])
+    assert [entry["domain"] for entry in answer["left_out"]] == ["paper"]
     assert "rrf" in answer["left_out"][0]["detail"]
     routes.delete("/v1/admin/domains/paper")
 
 
 def test_a_view_that_shows_nothing_leaves_all_as_probable_as_before(routes):
-    answer = asked(routes, {"dissimilarities": [1.0] * 30}, ["a"])
+    answer = answer_of(routes, {"dissimilarities": [1.0] * 30}, ["a"])
     assert (answer["informative"], answer["elsewhere"]) == (False, pytest.approx(0.02))
     assert "the view told nothing of the place" in answer["warnings"]
 
@@ -192,10 +192,10 @@ def test_an_image_is_encoded_once_for_all_domains_of_an_extractor(client, monkey
     evaluator = client.services.evaluators.evaluator({"kind": "feature_l2"})
     encode, n_encoded = type(evaluator).encode, []
     monkeypatch.setattr(type(evaluator), "encode", lambda self, images: n_encoded.append(1) or encode(self, images))
-    sent = {"content": encoded(picture(7)), "headers": JPEG}
-    answer = client.post(URL, params={"domains": ["seen", "seen-too", "ready"]}, **sent).json()
+    image_request = {"content": encoded(picture(7)), "headers": JPEG}
+    answer = client.post(URL, params={"domains": ["seen", "seen-too", "ready"]}, **image_request).json()
     assert {domain["domain"] for domain in answer["domains"]} == {"seen", "seen-too"}
-    assert {each["domain"]: each["code"] for each in answer["left_out"]} == {"ready": "unsupported_media_type"}
+    assert {entry["domain"]: entry["code"] for entry in answer["left_out"]} == {"ready": "unsupported_media_type"}
     assert len(n_encoded) == 1
     assert answer["top"][0]["map_image"] == 7
     client.delete("/v1/admin/domains/seen-too")
@@ -209,7 +209,7 @@ def test_a_key_asks_its_own_domains_alone(tmp_path):
         client.services.keys.load(client.services.catalog.keys)
         client.headers["X-API-Key"] = key.text
         view = {"encoding": ready_encodings()[3].tolist()}
-        assert [domain["domain"] for domain in asked(client, view)["domains"]] == ["mine"]
+        assert [domain["domain"] for domain in answer_of(client, view)["domains"]] == ["mine"]
         refused = problem(client.post(URL, json={**view, "domains": ["mine", "other"]}), 403, "forbidden")
         assert refused["domains"] == ["mine", "later"]
 
@@ -219,12 +219,12 @@ def test_maps_give_way_and_warming_brings_them_back(tmp_path):
         for name in ("a", "b"):
             make_domain(client, name, ready_encodings(), n_landmarks=10)
         view = {"encoding": ready_encodings()[3].tolist()}
-        answer = asked(client, view, ["a", "b"])
+        answer = answer_of(client, view, ["a", "b"])
         assert len(answer["domains"]) == 2, "those that are named are read whatever room there is"
         assert client.services.maps.n_loaded == 1
-        everywhere = asked(client, view)
-        assert [each["code"] for each in everywhere["left_out"]] == ["not_loaded"]
-        (cold,) = (each["domain"] for each in everywhere["left_out"])
+        full_answer = answer_of(client, view)
+        assert [entry["code"] for entry in full_answer["left_out"]] == ["not_loaded"]
+        (cold,) = (entry["domain"] for entry in full_answer["left_out"])
         assert client.post(f"/v1/admin/domains/{cold}/warm").status_code == 202
         assert client.services.maps.peek(cold) is not None
         problem(client.post("/v1/admin/domains/nowhere/warm"), 404, "unknown_domain")

@@ -25,7 +25,7 @@ from tests.contract.conftest import (
     problem,
     ready_encodings,
     small_settings,
-    until,
+    wait_until,
 )
 from tests.fleet.running import running
 
@@ -183,7 +183,7 @@ class WaitsForTheOther:
     def __call__(self, job, on_progress, is_cancelled):
         if job.config.get("seed") == 1:
             self.mine.touch()
-            until(lambda: len(list(self.meeting.glob("working-*"))) == 2)
+            wait_until(lambda: len(list(self.meeting.glob("working-*"))) == 2)
         return self.run(job, on_progress, is_cancelled)
 
 
@@ -277,8 +277,8 @@ def test_while_one_is_away_the_other_administers_and_what_it_had_is_there_when_i
     fleet.kill("admin-1")
     assert client.remap(first, **CONFIG)["state"] == "succeeded"
     assert client.get("/v1/domains").status_code == 200
-    until(lambda: fleet.pids("admin-1") not in ([], dying))
-    until(lambda: client.get(f"/v1/admin/domains/{second}/maps").status_code == 200)
+    wait_until(lambda: fleet.pids("admin-1") not in ([], dying))
+    wait_until(lambda: client.get(f"/v1/admin/domains/{second}/maps").status_code == 200)
     assert client.get(f"/v1/admin/domains/{second}/maps").json() == maps
     assert client.remap(second, **CONFIG)["state"] == "succeeded"
     assert len(jobs_listed(client)) == 8
@@ -288,7 +288,7 @@ def test_while_one_is_away_the_other_administers_and_what_it_had_is_there_when_i
 def test_a_key_counts_with_all_of_them_before_it_counts_with_the_first(client, data_dir, names):
     with Catalog.open(data_dir) as catalog:
         _, admin = catalog.create_key(KeyScope.ADMIN)
-    until(lambda: client.get(f"/v1/domains/{names[0]}").status_code == 401)
+    wait_until(lambda: client.get(f"/v1/domains/{names[0]}").status_code == 401)
     for name in (*names, "none"):
         assert client.get(f"/v1/domains/{name}").status_code == 401
         answer = client.get(f"/v1/domains/{name}", headers={"X-API-Key": admin.text})

@@ -35,7 +35,7 @@ from tests.contract.conftest import (  # noqa: E402
     ready_encodings,
     service,
     small_settings,
-    until,
+    wait_until,
 )
 from tests.fleet.running import ServeDeploySchema, from_yaml, running  # noqa: E402
 
@@ -89,7 +89,7 @@ def test_what_was_acknowledged_survives_the_death_of_either_owner(fleet, client,
             time.sleep(0.1)
         assert told(answer.json()) == wanted
         if seed == 30:  # both are back before the other one dies
-            until(lambda: fleet.pids(f"domains-{first}") and client.get("/metrics").text.count("\n"))
+            wait_until(lambda: fleet.pids(f"domains-{first}") and client.get("/metrics").text.count("\n"))
             time.sleep(0.1)
     assert client.delete(path_of(session)).status_code == 204
     problem(client.get(path_of(session)), 410, "ended_session")
@@ -117,11 +117,11 @@ def test_robots_go_on_while_a_replica_dies(fleet, client):
     for thread in robots:
         thread.start()
     time.sleep(1)
-    until(lambda: fleet.pids("domains-0"))  # it may have died before
+    wait_until(lambda: fleet.pids("domains-0"))  # it may have died before
     dying = fleet.pids("domains-0")
     fleet.kill("domains-0")
-    until(lambda: fleet.pids("domains-0") not in ([], dying))
-    until(lambda: not list(Path(tempfile.gettempdir()).glob(f"deepsimbad-replica-{dying[0]}-*")))
+    wait_until(lambda: fleet.pids("domains-0") not in ([], dying))
+    wait_until(lambda: not list(Path(tempfile.gettempdir()).glob(f"deepsimbad-replica-{dying[0]}-*")))
     time.sleep(1)
     stopped.set()
     for thread in robots:
@@ -164,8 +164,8 @@ def test_the_encoder_has_the_network_and_while_it_is_away_only_who_needs_it_is_t
     refused = problem(client.post(f"{session}/observations", **view), 503, "unavailable")
     assert "encoder" in refused["detail"]
     assert client.post("/v1/domains/ready/localizations", json=RANKS).status_code == 200
-    until(lambda: fleet.pids("encoder") not in ([], living))
-    until(lambda: client.post(f"{session}/observations", **view).json().get("n_observations") == 1)
+    wait_until(lambda: fleet.pids("encoder") not in ([], living))
+    wait_until(lambda: client.post(f"{session}/observations", **view).json().get("n_observations") == 1)
 
 
 def test_one_view_is_asked_of_the_owners_of_all_domains_and_the_answer_is_the_plain_services(fleet, client, tmp_path):
@@ -241,7 +241,7 @@ def test_keys_count_everywhere(tmp_path):
             assert stranger.recv(65536).startswith(b"HTTP/1.1 401 ")
         with Catalog.open(data_dir) as catalog:
             catalog.revoke_key(record.key_id)
-        until(lambda: own.get(session).status_code == 401)
+        wait_until(lambda: own.get(session).status_code == 401)
 
 
 def test_the_file_for_a_cluster_is_one():

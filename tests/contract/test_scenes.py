@@ -14,19 +14,21 @@ TEXT = {"Content-Type": "text/plain"}
 
 def objects_at(place, seed=0):
     """A route of objects: the nearer, the larger; another drive sees them a little elsewhere."""
-    rng, seen = np.random.default_rng(seed * 1000 + place), []
+    rng, scene_objects = np.random.default_rng(seed * 1000 + place), []
     for number in range(place, place + 8):
-        own = np.random.default_rng(number)
-        x, y = own.uniform(0.1, 0.8, 2) + rng.normal(0, 0.01, 2)
-        seen.append({"label": LABELS[own.integers(0, 6)], "box": [float(x), float(y), float(x) + 0.1, float(y) + 0.1]})
-    return seen
+        place_rng = np.random.default_rng(number)
+        x, y = place_rng.uniform(0.1, 0.8, 2) + rng.normal(0, 0.01, 2)
+        scene_objects.append(
+            {"label": LABELS[place_rng.integers(0, 6)], "box": [float(x), float(y), float(x) + 0.1, float(y) + 0.1]}
+        )
+    return scene_objects
 
 
 @pytest.fixture(scope="module")
 def objects(client):
-    made = client.put("/v1/admin/domains/objects", json={"evaluator": {"kind": "objects"}})
-    assert (made.status_code, made.json()["takes"]) == (201, ["objects"])
-    assert made.json()["evaluator"] == {"kind": "objects", "extractor": "none"}
+    answer = client.put("/v1/admin/domains/objects", json={"evaluator": {"kind": "objects"}})
+    assert (answer.status_code, answer.json()["takes"]) == (201, ["objects"])
+    assert answer.json()["evaluator"] == {"kind": "objects", "extractor": "none"}
     for seed, name in enumerate(("landmarks", "drive")):
         client.post("/v1/admin/domains/objects/traverses", json={"name": name})
         for place in range(N):
@@ -86,13 +88,13 @@ def test_forms_that_a_domain_does_not_take_are_415(client, objects):
     refused = problem(client.post(objects, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
     assert "text/plain" not in refused["allowed"]
     problem(client.post(objects, content=encoded(picture(1)), headers=JPEG), 415, "unsupported_media_type")
-    seen = "/v1/domains/seen/localizations"
-    refused = problem(client.post(seen, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
+    image_url = "/v1/domains/seen/localizations"
+    refused = problem(client.post(image_url, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
     assert "image/jpeg" in refused["allowed"]
-    problem(client.post(seen, json={"objects": objects_at(0)}), 415, "unsupported_media_type")
-    both = scene_observation({"objects": objects_at(0)}, encoded(picture(1)))
-    problem(client.post(seen, content=both.body, headers=both.headers), 415, "unsupported_media_type")
-    problem(client.post(objects, content=both.body[:-10], headers=both.headers), 422, "invalid_scene")
+    problem(client.post(image_url, json={"objects": objects_at(0)}), 415, "unsupported_media_type")
+    scene = scene_observation({"objects": objects_at(0)}, encoded(picture(1)))
+    problem(client.post(image_url, content=scene.body, headers=scene.headers), 415, "unsupported_media_type")
+    problem(client.post(objects, content=scene.body[:-10], headers=scene.headers), 422, "invalid_scene")
     mixed = client.post(objects, json={"objects": [], "encoding": [1.0]})
     assert "give exactly one" in problem(mixed, 422, "invalid_request")["detail"]
 
@@ -119,7 +121,7 @@ def test_a_text_places_a_view_in_any_order_of_words(client, language):
         as_text = client.post(language, content=text, headers={"Content-Type": "text/plain; charset=utf-8"}).json()
         as_json = client.post(language, json={"text": text}).json()
         assert as_text["retrieval"] == as_json["retrieval"]
-        assert place in [each["map_image"] for each in as_text["retrieval"][:3]]
+        assert place in [entry["map_image"] for entry in as_text["retrieval"][:3]]
 
 
 def test_texts_of_no_use_are_named(client, language):
@@ -138,27 +140,27 @@ def test_texts_of_no_use_are_named(client, language):
 @pytest.fixture(scope="module")
 def fused(client):
     of = [{"kind": "feature_l2", "extractor": "gradient_grid"}, {"kind": "objects"}]
-    made = client.put("/v1/admin/domains/fused", json={"evaluator": {"kind": "fused", "of": of}})
-    assert (made.status_code, made.json()["takes"]) == (201, ["image", "objects"])
+    answer = client.put("/v1/admin/domains/fused", json={"evaluator": {"kind": "fused", "of": of}})
+    assert (answer.status_code, answer.json()["takes"]) == (201, ["image", "objects"])
     for seed, name in enumerate(("landmarks", "drive")):
         client.post("/v1/admin/domains/fused/traverses", json={"name": name})
         for place in range(N):
-            both = scene_observation({"objects": objects_at(place, seed)}, encoded(picture(place)))
+            scene = scene_observation({"objects": objects_at(place, seed)}, encoded(picture(place)))
             url = f"/v1/admin/domains/fused/traverses/{name}/frames/{place}?position_m={place}"
-            assert client.put(url, content=both.body, headers=both.headers).status_code == 201
+            assert client.put(url, content=scene.body, headers=scene.headers).status_code == 201
     for relevance in ("rrf", "composed"):
-        how = {"landmark_traverse": "landmarks", "n_landmarks": 20, "same_route": True, "relevance": relevance}
-        job = client.remap("fused", **how)
+        config = {"landmark_traverse": "landmarks", "n_landmarks": 20, "same_route": True, "relevance": relevance}
+        job = client.remap("fused", **config)
         assert job["state"] == "succeeded", job
-        told = job["result"]["metrics"].get("fitting")
-        assert (told is not None and 0 <= told["weight"] <= 1) == (relevance == "rrf")
+        fitting = job["result"]["metrics"].get("fitting")
+        assert (fitting is not None and 0 <= fitting["weight"] <= 1) == (relevance == "rrf")
     return "/v1/domains/fused/localizations"
 
 
 def test_a_fused_view_brings_either_half_or_both(client, fused):
-    both = scene_observation({"objects": objects_at(9, 2)}, encoded(picture(9)))
+    scene = scene_observation({"objects": objects_at(9, 2)}, encoded(picture(9)))
     answers = [
-        client.post(fused, content=both.body, headers=both.headers),
+        client.post(fused, content=scene.body, headers=scene.headers),
         client.post(fused, content=encoded(picture(9)), headers=JPEG),
         client.post(fused, json={"objects": objects_at(9, 2)}),
     ]
@@ -191,22 +193,22 @@ def test_an_image_alone_in_a_form_is_that_image(client):
     assert client.post("/v1/domains/seen/localizations", **form(image=encoded(picture(1)))).json()["informative"]
 
 
-@pytest.mark.parametrize("told", [form(), form(text=b""), form(objects=b"null"), {"json": {"objects": None}}])
-def test_what_tells_nothing_is_named_and_harms_nobody(client, told):
+@pytest.mark.parametrize("view_request", [form(), form(text=b""), form(objects=b"null"), {"json": {"objects": None}}])
+def test_what_tells_nothing_is_named_and_harms_nobody(client, view_request):
     for kind in ("seen", "objects"):
-        problem(client.post(f"/v1/domains/{kind}/localizations", **told), 422, "invalid_scene")
+        problem(client.post(f"/v1/domains/{kind}/localizations", **view_request), 422, "invalid_scene")
     client.put("/v1/admin/domains/hollow", json={"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}})
     client.post("/v1/admin/domains/hollow/traverses", json={"name": "drive"})
     frame = "/v1/admin/domains/hollow/traverses/drive/frames/0?position_m=0"
-    problem(client.put(frame, **told), 422, "invalid_scene")
+    problem(client.put(frame, **view_request), 422, "invalid_scene")
     assert client.put(frame, content=encoded(picture(1)), headers=JPEG).is_success
 
 
 def test_a_frame_of_a_fused_map_has_both_halves(client, fused):
     frame = "/v1/admin/domains/fused/traverses/drive/frames/99?position_m=99"
     assert problem(client.put(frame, json={"objects": objects_at(9)}), 422, "invalid_scene")["missing"] == ["image"]
-    halved = client.put(frame, content=encoded(picture(9)), headers=JPEG)
-    assert problem(halved, 422, "invalid_scene")["missing"] == ["objects"]
+    image_alone = client.put(frame, content=encoded(picture(9)), headers=JPEG)
+    assert problem(image_alone, 422, "invalid_scene")["missing"] == ["objects"]
 
 
 @pytest.mark.parametrize(

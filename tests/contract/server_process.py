@@ -15,11 +15,11 @@ import numpy as np
 
 from deepsimbad_client.http.local_server import LocalServer
 
-from .conftest import IS_FLEET, until
+from .conftest import IS_FLEET, wait_until
 
 
-class Served(LocalServer):
-    """The process; `program` stands in for the command; it is given the data directory first and the port last."""
+class ServerProcess(LocalServer):
+    """The process; a `program`, run in place of the command, gets the data directory first and the port last."""
 
     def __init__(self, data_dir, program=None, **settings):
         variables = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
@@ -27,8 +27,8 @@ class Served(LocalServer):
         if program is not None:
             self.command = [sys.executable, "-c", program, str(data_dir)]
         elif IS_FLEET:
-            told = ["--replicas", "2", "--data-dir", str(data_dir), "--map-store", f"file://{data_dir}-store"]
-            self.command = [sys.executable, "-m", "deepsimbad", "ray", "serve", *told]
+            options = ["--replicas", "2", "--data-dir", str(data_dir), "--map-store", f"file://{data_dir}-store"]
+            self.command = [sys.executable, "-m", "deepsimbad", "ray", "serve", *options]
 
     def connect(self):
         return socket.create_connection(("127.0.0.1", self.port), timeout=120)
@@ -40,8 +40,8 @@ class Served(LocalServer):
             with contextlib.suppress(OSError):  # refused while it was sent
                 connection.sendall(message)
             with contextlib.suppress(ConnectionError):
-                while more := connection.recv(65536):
-                    received += more
+                while piece := connection.recv(65536):
+                    received += piece
         return bytes(received)
 
     @cached_property
@@ -49,36 +49,36 @@ class Served(LocalServer):
         """The processes that answer: this one, or those of the fleet that it began."""
         if not IS_FLEET:
             return [self.pid]
-        parents, titled = {}, []
+        parents, replica_pids = {}, []
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                parents[int(process.name)] = told(process, "PPid")
+                parents[int(process.name)] = process_number(process, "PPid")
                 if (process / "cmdline").read_bytes().startswith(b"ray::ServeReplica:"):
-                    titled.append(int(process.name))
+                    replica_pids.append(int(process.name))
 
         def is_ours(pid):
             while pid not in {0, self.pid}:
                 pid = parents.get(pid, 0)
             return pid == self.pid
 
-        return [pid for pid in titled if is_ours(pid)]
+        return [pid for pid in replica_pids if is_ours(pid)]
 
     def forget_peak(self):
-        """Let the peak of memory be what it is now."""
+        """Set the peak of memory to what is held now."""
         for pid in self.answering:
             Path(f"/proc/{pid}/clear_refs").write_text("5")
 
     def mib(self, name="VmRSS"):
         """Memory held now by each process that answers; `VmHWM`: its peak."""
-        return np.array([told(Path(f"/proc/{pid}"), name) for pid in self.answering]) / 1024
+        return np.array([process_number(Path(f"/proc/{pid}"), name) for pid in self.answering]) / 1024
 
     @contextlib.contextmanager
-    def within(self, most_mib):
-        """What is done inside costs no process more memory, not for a moment."""
+    def limited(self, most_mib):
+        """Check that inside the block no process ever holds `most_mib` more memory than before it."""
         self.forget_peak()
-        before = self.mib()
+        before_mib = self.mib()
         yield
-        assert max(self.mib("VmHWM") - before) < most_mib
+        assert max(self.mib("VmHWM") - before_mib) < most_mib
 
     @property
     def n_sockets(self):
@@ -91,8 +91,8 @@ class Served(LocalServer):
         return n_open
 
 
-def told(process, name):
-    """A number of a process's status."""
+def process_number(process, name):
+    """A number by its name in a process's status file."""
     for line in (process / "status").read_text().splitlines():
         if line.startswith(f"{name}:"):
             return int(line.split()[1])
@@ -103,14 +103,14 @@ def told(process, name):
 class Robot:
     """Localizes and observes all along on a connection of its own, and notes what went wrong."""
 
-    served: Served
+    server: ServerProcess
     n_answered: int = 0
     faults: list[str] = field(default_factory=list)
     stopped: threading.Event = field(default_factory=threading.Event)
     turn: threading.Lock = field(default_factory=threading.Lock)  # held by whoever wants it to ask nothing
 
     def drive(self):
-        connection = http.client.HTTPConnection("127.0.0.1", self.served.port, timeout=120)
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=120)
 
         def ask(path, body):
             connection.request("POST", path, json.dumps(body), {"Content-Type": "application/json"})
@@ -134,7 +134,7 @@ class Robot:
             connection.close()
 
     def answered_more(self, n_more):
-        """Wait until so many more were answered."""
-        wanted = self.n_answered + n_more
-        until(lambda: self.faults or self.n_answered >= wanted)
+        """Wait until `n_more` requests more were answered."""
+        n_wanted = self.n_answered + n_more
+        wait_until(lambda: self.faults or self.n_answered >= n_wanted)
         assert self.faults == [], self.faults
