@@ -282,30 +282,39 @@ def _search(
     n, r = products.shape
     h, width = weights.size, min(_BEAM, r)
     # Of the sum of every partial list: its product with the place, its square, its products with all landmarks.
-    dots, squares = np.empty(width, np.float32), np.empty(width, np.float32)
-    cross = np.empty((width, r), np.float32)
-    ids = np.empty((width, h), np.int64)
+    # Each twice, since the lists of one length are made from those one landmark shorter.
+    dots, squares = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
+    cross = np.empty((2, width, r), np.float32)
+    ids = np.empty((2, width, h), np.int64)
     best, best_of, best_id = np.empty(width, np.float32), np.empty(width, np.int64), np.empty(width, np.int64)
     scores = np.empty(r, np.float32)
     for i in range(n):
         n_partial = 1
-        dots[0], squares[0] = 0.0, 0.0
-        cross[0] = 0.0
+        dots[0, 0], squares[0, 0] = 0.0, 0.0
+        cross[0, 0] = 0.0
         for depth in range(h):
-            w, n_best = weights[depth], 0
+            w, n_best, old = weights[depth], 0, depth % 2
             for b in range(n_partial):
                 for k in range(r):
-                    square = squares[b] + w * (2 * cross[b, k] + w)
-                    scores[k] = (dots[b] + w * products[i, k]) / np.sqrt(max(square, np.float32(1e-9)))
+                    square = squares[old, b] + w * (2 * cross[old, b, k] + w)
+                    scores[k] = (dots[old, b] + w * products[i, k]) / np.sqrt(max(square, np.float32(1e-9)))
                 for j in range(depth):
-                    scores[ids[b, j]] = -np.inf
+                    scores[ids[old, b, j]] = -np.inf
                 for k in range(r):
                     if scores[k] > -np.inf and (n_best < width or scores[k] > best[width - 1]):
                         n_best = _insert(best, best_of, best_id, n_best, scores[k], b, k)
-            _grow(dots, squares, cross, ids, best_of[:n_best], best_id[:n_best], depth, w, products[i], gram)
+            for b in range(n_best):
+                base, k = best_of[b], best_id[b]
+                dots[1 - old, b] = dots[old, base] + w * products[i, k]
+                squares[1 - old, b] = squares[old, base] + w * (2 * cross[old, base, k] + w)
+                for j in range(r):
+                    cross[1 - old, b, j] = cross[old, base, j] + w * gram[k, j]
+                for j in range(depth):
+                    ids[1 - old, b, j] = ids[old, base, j]
+                ids[1 - old, b, depth] = k
             n_partial = n_best
         for depth in range(h):
-            lists[i, depth] = ids[0, depth]
+            lists[i, depth] = ids[h % 2, 0, depth]
 
 
 @njit(cache=True, nogil=True)
@@ -318,21 +327,6 @@ def _insert(best: Any, best_of: Any, best_id: Any, n_best: int, score: float, pa
     best[rank], best_of[rank], best_id[rank] = score, partial, landmark
     n_longer: int = min(n_best + 1, best.size)
     return n_longer
-
-
-@njit(cache=True, nogil=True)
-def _grow(
-    dots: Any, squares: Any, cross: Any, ids: Any, base: Any, landmark: Any, depth: int, w: Any, product: Any, gram: Any
-) -> None:
-    """Replace the partial lists by those at `base`, each one landmark longer."""
-    n = base.size
-    dots[:n], squares[:n], cross[:n], ids[:n] = dots[base], squares[base], cross[base], ids[base]
-    for b in range(n):
-        k = landmark[b]
-        dots[b] += w * product[k]
-        squares[b] += w * (2 * cross[b, k] + w)
-        cross[b] += w * gram[k]
-        ids[b, depth] = k
 
 
 def lengths_of_sums(lists: NDArray[np.uint16], landmarks: NDArray[np.float32]) -> NDArray[np.float32]:

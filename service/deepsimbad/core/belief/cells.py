@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numba import njit
@@ -94,6 +94,13 @@ class Cells:
         length_m = self.step_m * self.n_cells
         last_m = (self.place_m[-1] + self.place_m[0] + length_m) / 2
         return np.concatenate([[last_m - length_m], middle_m, [last_m]])
+
+
+@njit(cache=True, nogil=True)
+def copy_into(target: NDArray[Any], source: NDArray[Any]) -> None:
+    """`target[:] = source`, whose check of shapes numba compiles for seconds."""
+    for i in range(target.size):
+        target[i] = source[i]
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief.cells import SUMS
+from deepsimbad.core.belief.cells import SUMS, copy_into
 from deepsimbad.core.belief.evidence import (
     LEAST_ALLOWED,
     LOST_AT_FIX,
@@ -289,15 +289,15 @@ def _shift_and_spread(
     for t in range(n_trusts):
         if closed:
             turn = shift % n
-            _copy(on_route[turn:], masses[t, : n - turn])
-            _copy(on_route[:turn], masses[t, n - turn :])
-            _copy(source[:width], source[n : n + width])
-            _copy(source[width + n :], source[width : 2 * width])
+            copy_into(on_route[turn:], masses[t, : n - turn])
+            copy_into(on_route[:turn], masses[t, n - turn :])
+            copy_into(source[:width], source[n : n + width])
+            copy_into(source[width + n :], source[width : 2 * width])
         else:
             first_inside = max(first, -shift)  # cells from here on do not move past an end,
             stop_inside = max(first_inside, min(stop, n - shift))  # until here
             source[: width + first_inside + shift] = 0.0
-            _copy(on_route[first_inside + shift : stop_inside + shift], masses[t, first_inside:stop_inside])
+            copy_into(on_route[first_inside + shift : stop_inside + shift], masses[t, first_inside:stop_inside])
             source[width + stop_inside + shift :] = 0.0
             for i in range(first, min(first_inside, stop)):
                 on_route[0] += masses[t, i]
@@ -324,21 +324,14 @@ def _shift_and_spread(
 
 
 @njit(cache=True, nogil=True)
-def _copy(target: NDArray[np.float64], source: NDArray[np.float64]) -> None:
-    """`target[:] = source`, whose check of shapes numba compiles for seconds."""
-    for i in range(target.size):
-        target[i] = source[i]
-
-
-@njit(cache=True, nogil=True)
 def _shift(values: NDArray[np.float64], shift: int, closed: bool) -> NDArray[np.float64]:
     """[c] values at cells, moved along with the robot by whole cells; what lies before an open route is 0."""
     carried, n = np.zeros_like(values), values.size
     by = shift % n if closed else min(max(shift, -n), n)
     if by >= 0:
-        _copy(carried[by:], values[: n - by])
+        copy_into(carried[by:], values[: n - by])
     else:
-        _copy(carried[:by], values[-by:])
+        copy_into(carried[:by], values[-by:])
     if closed:
-        _copy(carried[:by], values[n - by :])
+        copy_into(carried[:by], values[n - by :])
     return carried

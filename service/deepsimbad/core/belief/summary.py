@@ -155,10 +155,10 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float32], sha
             class_members[count] = mass[i]
             count += 1
     ascending = np.sort(class_members[:count])
-    for at in range(count - 1, -1, -1):
-        total += ascending[at]
+    for i in range(count - 1, -1, -1):
+        total += ascending[i]
         if total >= share * _ENOUGH:
-            return entropy, ascending[at]
+            return entropy, ascending[i]
     return entropy, ascending[0] if count else mass.max()
 
 

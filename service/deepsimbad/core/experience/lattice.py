@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief.cells import copy_into
 from deepsimbad.core.belief.motion import move_error
 from deepsimbad.core.route import Route
 
@@ -146,11 +147,11 @@ def _step(
             _blur(buffer, taps[e], np.float32(n_cells) / total, belief)
         else:
             belief *= np.float32(n_cells) / belief.sum()
-        at_cells[:] = belief
+        copy_into(at_cells, belief)
         if (
             _see(belief, evidence[e], image_of_cell, additive) <= 0
         ):  # the belief had excluded all that the view allows, and stays
-            belief[:] = at_cells
+            copy_into(belief, at_cells)
         ranks[e] = _rank(belief, images_in_cell, true_cell[e])
 
 
@@ -162,17 +163,17 @@ def _shift(
     n = belief.size
     if closed:
         shift %= n
-        buffer[shift:] = belief[: n - shift]
-        buffer[:shift] = belief[n - shift :]
+        copy_into(buffer[shift:], belief[: n - shift])
+        copy_into(buffer[:shift], belief[n - shift :])
     elif shift >= 0:
         shift = min(shift, n)
         buffer[:shift] = 0
-        buffer[shift:] = belief[: n - shift]
+        copy_into(buffer[shift:], belief[: n - shift])
         if fraction > 0 and n > shift:  # the last cell's part would be past the end
             buffer[n - 1] = 0
     else:
         shift = max(shift, -n)
-        buffer[: n + shift] = belief[-shift:]
+        copy_into(buffer[: n + shift], belief[-shift:])
         buffer[n + shift :] = 0
     if fraction > 0:
         last = buffer[n - 1]
@@ -191,8 +192,8 @@ def _pad(buffer: NDArray[np.float32], reach: int, n: int, taps: NDArray[np.float
     if reach == 0:
         return
     if closed:
-        buffer[:reach] = buffer[n : n + reach]
-        buffer[reach + n : 2 * reach + n] = buffer[reach : 2 * reach]
+        copy_into(buffer[:reach], buffer[n : n + reach])
+        copy_into(buffer[reach + n : 2 * reach + n], buffer[reach : 2 * reach])
         return
     for c in range(min(reach, n)):
         buffer[reach + c] /= _inside(taps, reach, c, n)
@@ -217,7 +218,8 @@ def _blur(
     """Write the blurred buffer, times `scale`, into the belief, a block of cells at a time."""
     n = belief.size
     weights = np.zeros(-(-taps.size // _TAPS_AT_ONCE) * _TAPS_AT_ONCE, np.float32)
-    weights[: taps.size] = taps * scale
+    for k in range(taps.size):
+        weights[k] = taps[k] * scale
     for start in range(0, n, _BLOCK):
         stop = min(start + _BLOCK, n)
         block = belief[start:stop]

@@ -162,10 +162,12 @@ def _code(
                 _sum_alike(own_likeness, likeness, row[:j], shares[0])
                 worth = shares[1, j] * previous_likeness + shares[2, j] * own_likeness
                 _weigh_others(likelihoods, worth, last_images, image - _RECENT, powers)
-                likelihoods[row[:j]] = 1  # a landmark twice in a list is all but impossible
+                for landmark in row[:j]:
+                    likelihoods[landmark] = 1  # a landmark twice in a list is all but impossible
                 likelihoods[earlier] = 0
                 row[j] = _symbol(likelihoods, int(row[j]), coder, stream, is_read)
-        previous[:h] = row
+        for j in range(h):
+            previous[j] = row[j]
         last_images[row] = image
     if is_read:
         return int(coder[_AT] - _STATE_BITS + 2 + 7) // 8
