@@ -48,8 +48,8 @@ class Fleet:
         pids = []
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                told = (process / "cmdline").read_bytes().partition(b"\0")[0]
-                if told.partition(b".")[0] == title:  # behind a dot stands what it does
+                process_title = (process / "cmdline").read_bytes().partition(b"\0")[0]
+                if process_title.partition(b".")[0] == title:  # behind a dot stands what it does
                     pids.append(int(process.name))
         return pids
 

@@ -52,7 +52,7 @@ def administered_by(number, of=2):
 
 
 @dataclass(eq=False)
-class Told(Backend):
+class Administrator(Backend):
     """One that administers, and knows who made which domain, and its own jobs."""
 
     made_by: dict[str, int] | None = None  # None: it is away
@@ -64,63 +64,65 @@ class Told(Backend):
         return self.made_by.get(*arguments) if method == "administrator_of" else arguments[0] in self.jobs
 
 
-def asked(administrators, path, query=b""):
+def candidates(administrators, path, query=b""):
     """The places of those who may answer."""
-    who = asyncio.run(administrators.of(path, query))
-    return [administrators.backends.index(backend) for backend in who]
+    backends = asyncio.run(administrators.of(path, query))
+    return [administrators.backends.index(backend) for backend in backends]
 
 
 def of_two(made_by):
-    return Administrators([Told(None, made_by=made_by, jobs=("a",)), Told(None, made_by=made_by, jobs=("b",))])
+    return Administrators(
+        [Administrator(None, made_by=made_by, jobs=("a",)), Administrator(None, made_by=made_by, jobs=("b",))]
+    )
 
 
 @pytest.mark.parametrize("path", ["/v1/admin/domains/{}", "/v1/domains/{}/coverage", "/v1/admin/domains/{}/traverses"])
 def test_what_is_of_a_domain_is_its_administrators(path):
     first, second = next(administered_by(0)), next(administered_by(1))
-    assert [asked(of_two({}), path.format(name)) for name in (first, second)] == [[0], [1]], "who is to make it"
-    made = of_two({first: 1, second: 0})  # while there were others
-    assert [asked(made, path.format(name)) for name in (first, second)] == [[1], [0]]
-    assert asked(made, "/v1/admin/jobs", f"limit=3&domain={first}".encode()) == [1]
+    assert [candidates(of_two({}), path.format(name)) for name in (first, second)] == [[0], [1]], "who is to make it"
+    administrators = of_two({first: 1, second: 0})  # while there were others
+    assert [candidates(administrators, path.format(name)) for name in (first, second)] == [[1], [0]]
+    assert candidates(administrators, "/v1/admin/jobs", f"limit=3&domain={first}".encode()) == [1]
 
 
 def test_a_domain_whose_administrator_there_is_not_is_refused_by_name():
-    with pytest.raises(UnavailableError, match="--administrators 3 or more") as refused:
-        asked(of_two({"far": 2}), "/v1/admin/domains/far/remaps")
-    assert refused.value.hints["reason"] == "no_administrator"
+    with pytest.raises(UnavailableError, match="--administrators 3 or more") as refusal:
+        candidates(of_two({"far": 2}), "/v1/admin/domains/far/remaps")
+    assert refusal.value.hints["reason"] == "no_administrator"
     with pytest.raises(UnavailableError, match="--administrators 2 or more"):
-        asked(Administrators([Told(None, made_by={"far": 1})]), "/v1/domains/far")
+        candidates(Administrators([Administrator(None, made_by={"far": 1})]), "/v1/domains/far")
 
 
 def test_a_domain_made_anew_is_whose_it_is_now():
     administrators = of_two({"moved": 2})
     with pytest.raises(UnavailableError, match="--administrators 3 or more"):
-        asked(administrators, "/v1/domains/moved")
+        candidates(administrators, "/v1/domains/moved")
     for number in (1, 0):
         for backend in administrators.backends:
             backend.made_by["moved"] = number
-        assert asked(administrators, "/v1/domains/moved") == [number]
+        assert candidates(administrators, "/v1/domains/moved") == [number]
 
 
 def test_a_job_is_whose_it_is_and_what_is_of_no_domain_is_anybodys():
     administrators = of_two({})
-    assert [asked(administrators, f"/v1/admin/jobs/{job}") for job in ("a", "b", "c")] == [[0], [1], [0]]
-    assert asked(administrators, "/v1/admin/jobs/b/events") == [1]
+    assert [candidates(administrators, f"/v1/admin/jobs/{job}") for job in ("a", "b", "c")] == [[0], [1], [0]]
+    assert candidates(administrators, "/v1/admin/jobs/b/events") == [1]
     for path in ("/v1/domains", "/v1/admin/jobs", "/v1/admin/sessions", "/console", "/healthz"):
-        assert asked(administrators, path) == [0, 1]
+        assert candidates(administrators, path) == [0, 1]
 
 
 def test_while_one_is_away_the_other_tells_whose_domains_are():
     second = next(administered_by(1))
     administrators = of_two({})
     administrators.backends[0].made_by = None
-    assert asked(administrators, f"/v1/admin/domains/{second}") == [1]
-    assert asked(administrators, "/v1/admin/jobs/b") == [1]
+    assert candidates(administrators, f"/v1/admin/domains/{second}") == [1]
+    assert candidates(administrators, "/v1/admin/jobs/b") == [1]
     for job in ("a", "c"):
         with pytest.raises(UnavailableError, match="away"):
-            asked(administrators, f"/v1/admin/jobs/{job}")
+            candidates(administrators, f"/v1/admin/jobs/{job}")
     administrators.backends[1].made_by = None
     with pytest.raises(UnavailableError, match="away"):
-        asked(administrators, f"/v1/admin/domains/{second}")
+        candidates(administrators, f"/v1/admin/domains/{second}")
 
 
 def test_one_that_does_not_answer_soon_is_as_one_that_is_away(monkeypatch):
@@ -132,10 +134,10 @@ def test_one_that_does_not_answer_soon_is_as_one_that_is_away(monkeypatch):
 
     administrators.backends[0].ask = never
     second = next(administered_by(1))
-    assert asked(administrators, f"/v1/admin/domains/{second}") == [1]
-    assert asked(administrators, "/v1/admin/jobs/b") == [1]
+    assert candidates(administrators, f"/v1/admin/domains/{second}") == [1]
+    assert candidates(administrators, "/v1/admin/jobs/b") == [1]
     with pytest.raises(UnavailableError, match="away"):
-        asked(administrators, "/v1/admin/jobs/a")
+        candidates(administrators, "/v1/admin/jobs/a")
 
 
 class Queued:
@@ -144,7 +146,7 @@ class Queued:
     def __init__(self, jobs=None):
         self.answer, self.jobs, self.is_cancelled = jobs, self, False
 
-    def remote(self, before, limit):
+    def remote(self, last_key, limit):
         return self
 
     def result(self, timeout_s):
@@ -158,15 +160,15 @@ class Queued:
 
 def test_jobs_of_one_that_is_away_are_not_waited_for_after_the_refusal(tmp_path):
     jobs = AllJobs()
-    jobs.others = [Queued([]), Queued(), Queued()]
+    jobs.other_administrators = [Queued([]), Queued(), Queued()]
     with Catalog.open(tmp_path) as catalog:
-        with pytest.raises(UnavailableError, match="one of those that administer is away") as refused:
+        with pytest.raises(UnavailableError, match="one of those that administer is away") as refusal:
             jobs.newest(catalog, None, None, 5)
-        assert refused.value.hints["retry_after_s"] > 0
-        assert all(answer.is_cancelled for answer in jobs.others[1:])
-        jobs.others = [Queued([])]
+        assert refusal.value.hints["retry_after_s"] > 0
+        assert all(answer.is_cancelled for answer in jobs.other_administrators[1:])
+        jobs.other_administrators = [Queued([])]
         assert jobs.newest(catalog, None, None, 5).records == ()
-        assert not jobs.others[0].is_cancelled
+        assert not jobs.other_administrators[0].is_cancelled
 
 
 # A fleet
@@ -178,11 +180,11 @@ class WaitsForTheOther:
     def __init__(self, data_dir):
         self.run = InThisProcess(data_dir)
         self.meeting = data_dir.parent.parent if data_dir.parent.name == "administrators" else data_dir
-        self.mine = self.meeting / f"working-{data_dir.name}"
+        self.mark = self.meeting / f"working-{data_dir.name}"
 
     def __call__(self, job, on_progress, is_cancelled):
         if job.config.get("seed") == 1:
-            self.mine.touch()
+            self.mark.touch()
             wait_until(lambda: len(list(self.meeting.glob("working-*"))) == 2)
         return self.run(job, on_progress, is_cancelled)
 
@@ -198,11 +200,11 @@ CONFIG = {"training_traverse": "drive", "landmark_traverse": "drive", "n_landmar
 
 def jobs_listed(client, query=""):
     """Pages of two, one behind the other."""
-    jobs, after = [], ""
-    while after is not None:
-        answer = client.get(f"/v1/admin/jobs?limit=2{query}{after}").json()
+    jobs, cursor = [], ""
+    while cursor is not None:
+        answer = client.get(f"/v1/admin/jobs?limit=2{query}{cursor}").json()
         jobs += answer["jobs"]
-        after = answer["next"] and f"&after={answer['next']}"
+        cursor = answer["next"] and f"&after={answer['next']}"
     return jobs
 
 
@@ -233,18 +235,18 @@ def test_two_domains_are_filled_and_mapped_at_once_and_listed_together(client, d
     for name in names:
         filled(client, name)
     folders = data_dir, data_dir / "administrators" / "1"
-    for name, own, other in zip(names, folders, folders[::-1], strict=True):
-        assert traverse_path(own, name, "drive").exists()
-        assert not traverse_path(other, name, "drive").exists()
-    posted = [client.post(f"/v1/admin/domains/{name}/remaps", json={**CONFIG, "seed": 1}) for name in names]
-    jobs = [client.wait_for(answer.json()["job_id"]) for answer in posted]
+    for name, folder, other_folder in zip(names, folders, folders[::-1], strict=True):
+        assert traverse_path(folder, name, "drive").exists()
+        assert not traverse_path(other_folder, name, "drive").exists()
+    answers = [client.post(f"/v1/admin/domains/{name}/remaps", json={**CONFIG, "seed": 1}) for name in names]
+    jobs = [client.wait_for(answer.json()["job_id"]) for answer in answers]
     assert [job["state"] for job in jobs] == ["succeeded"] * 2, jobs
     assert [job["domain"] for job in jobs] == list(names)
     for name in names:
         assert client.post(f"/v1/domains/{name}/localizations", json=RANKS).json()["map_version"] == 1
         assert client.session(name)
-    listed = client.get("/v1/domains").json()["domains"]
-    assert [(domain["name"], domain["map_version"]) for domain in listed] == [(name, 1) for name in sorted(names)]
+    domains = client.get("/v1/domains").json()["domains"]
+    assert [(domain["name"], domain["map_version"]) for domain in domains] == [(name, 1) for name in sorted(names)]
     assert len(client.get("/v1/admin/sessions").json()["sessions"]) == 2
     ready = client.get("/readyz")
     assert ready.json() == {"status": "ready", "damaged_maps": []}
@@ -255,15 +257,15 @@ def test_two_domains_are_filled_and_mapped_at_once_and_listed_together(client, d
 @of_fleet
 def test_jobs_are_one_list_in_the_order_of_their_making(client, names):
     first, second = names
-    made = [client.remap(name, **CONFIG)["job_id"] for name in (second, first, first, second)]
-    listed = jobs_listed(client)
-    assert [job["job_id"] for job in listed[:4]] == made[::-1]
-    assert len(listed) == len({job["job_id"] for job in listed}) == 6
+    job_ids = [client.remap(name, **CONFIG)["job_id"] for name in (second, first, first, second)]
+    jobs = jobs_listed(client)
+    assert [job["job_id"] for job in jobs[:4]] == job_ids[::-1]
+    assert len(jobs) == len({job["job_id"] for job in jobs}) == 6
     for name in names:
-        of_domain = jobs_listed(client, f"&domain={name}")
-        assert of_domain == [job for job in listed if job["domain"] == name]
-    assert client.get(f"/v1/admin/jobs/{made[0]}/events").text.count("event: done") == 1
-    assert client.delete(f"/v1/admin/jobs/{made[0]}").status_code == 204
+        domain_jobs = jobs_listed(client, f"&domain={name}")
+        assert domain_jobs == [job for job in jobs if job["domain"] == name]
+    assert client.get(f"/v1/admin/jobs/{job_ids[0]}/events").text.count("event: done") == 1
+    assert client.delete(f"/v1/admin/jobs/{job_ids[0]}").status_code == 204
     problem(client.get("/v1/admin/jobs/none"), 404, "unknown_job")
 
 
@@ -299,18 +301,18 @@ def test_a_key_counts_with_all_of_them_before_it_counts_with_the_first(client, d
 def test_another_number_moves_no_domain(tmp_path: Path):
     settings = small_settings(tmp_path / "data", map_store=f"file://{tmp_path}/store")
     names = administered_by(1)
-    before, of_second = next(names), next(names)
+    earlier_name, later_name = next(names), next(names)
     with running(settings, make_run_job=InThisProcess) as fleet, Caller(base_url=fleet.url, timeout=120) as client:
-        filled(client, before)  # which would be the second's, had it been there
+        filled(client, earlier_name)  # which would be the second's, had it been there
     with (
         running(settings, make_run_job=InThisProcess, n_administrators=2) as fleet,
         Caller(base_url=fleet.url, timeout=120) as client,
     ):
-        filled(client, of_second)
-        for name in (before, of_second):
+        filled(client, later_name)
+        for name in (earlier_name, later_name):
             assert client.remap(name, **CONFIG)["state"] == "succeeded"
     with running(settings, make_run_job=InThisProcess) as fleet, Caller(base_url=fleet.url, timeout=120) as client:
-        refused = problem(client.get(f"/v1/admin/domains/{of_second}/traverses"), 503, "unavailable")
-        assert refused["reason"] == "no_administrator"
-        assert client.get(f"/v1/admin/domains/{before}/traverses/drive").status_code == 200
-        assert client.post(f"/v1/domains/{of_second}/localizations", json=RANKS).status_code == 200, "robots go on"
+        refusal = problem(client.get(f"/v1/admin/domains/{later_name}/traverses"), 503, "unavailable")
+        assert refusal["reason"] == "no_administrator"
+        assert client.get(f"/v1/admin/domains/{earlier_name}/traverses/drive").status_code == 200
+        assert client.post(f"/v1/domains/{later_name}/localizations", json=RANKS).status_code == 200, "robots go on"

@@ -20,14 +20,14 @@ FILES = ("lists", "truths", "localizations")
 def test_a_fleet_keeps_the_contract():
     files = [f"tests/contract/test_{name}.py" for name in FILES]
     # It is no part of this run.
-    whole = {name: value for name, value in os.environ.items() if name != "PYTEST_XDIST_WORKER"}
-    done = subprocess.run(
+    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_XDIST_WORKER"}
+    process = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *files],
         cwd=ROOT,
-        env={**whole, "TEST_FLEET": "1"},
+        env={**environment, "TEST_FLEET": "1"},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stdout[-5000:]
-    assert " passed" in done.stdout
+    assert process.returncode == 0, process.stdout[-5000:]
+    assert " passed" in process.stdout

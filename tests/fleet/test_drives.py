@@ -64,12 +64,12 @@ def packs(monkeypatch: pytest.MonkeyPatch) -> int:
     return 8
 
 
-def elsewhere(drive: Path, folder: Path, on_progress: Any, kind: str = "gradient_grid") -> list[Any]:
+def encoded_blocks(drive: Path, folder: Path, on_progress: Any, kind: str = "gradient_grid") -> list[Any]:
     configuration = evaluator_config({"kind": "feature_l2", "extractor": kind})
-    measure = make_evaluator(configuration, Compute())
+    evaluator = make_evaluator(configuration, Compute())
     recording = read_folder(drive, 1.0)
-    given = (recording, measure, dict(configuration.as_dict()), Compute(), 50_000_000)
-    return list(drives.encoded_elsewhere(*given, folder, on_progress))
+    arguments = (recording, evaluator, dict(configuration.as_dict()), Compute(), 50_000_000)
+    return list(drives.encoded_elsewhere(*arguments, folder, on_progress))
 
 
 class Noon(datetime):
@@ -123,18 +123,18 @@ def test_a_drive_in_an_object_store_is_copied_and_makes_the_same_map(
         for name, value in bucket.environment.items():
             monkeypatch.setenv(name, value)
         bucket.requests.clear()
-        copied = next(Path("many/copied-drives").glob(f"*/{drive.name}"))
-        (copied / "031.png").unlink()
-        os.utime(copied / "032.png", (1, 1))
+        copy = next(Path("many/copied-drives").glob(f"*/{drive.name}"))
+        (copy / "031.png").unlink()
+        os.utime(copy / "032.png", (1, 1))
         assert run([*many, f"{url}#5:"]) == 0
-        fetched = [request for request in bucket.requests if ".png" in request]
-        assert sorted(request.rpartition("/")[2] for request in fetched) == ["031.png", "032.png"]
+        requests = [request for request in bucket.requests if ".png" in request]
+        assert sorted(request.rpartition("/")[2] for request in requests) == ["031.png", "032.png"]
         contents = []
         for data_dir in ("one", "many"):
             with Catalog.open(Path(data_dir)) as catalog:
                 contents.append(catalog.map_path("route", 1).read_bytes())
         assert contents[0] == contents[1], "nothing in it tells where the images were"
-        assert not copied.exists()
+        assert not copy.exists()
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", "stranger")
         assert run([*many, url]) == 1
         assert "credentials" in capsys.readouterr().err
@@ -165,11 +165,11 @@ def test_what_was_encoded_before_a_kill_is_not_encoded_again(drive: Path, packs:
             raise CancelledError("killed")
 
     with pytest.raises(CancelledError):
-        elsewhere(drive, tmp_path, stop)
+        encoded_blocks(drive, tmp_path, stop)
     files = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*.npz")}
     assert N_FRAMES // packs // 2 <= len(files) < N_FRAMES // packs
     shares: list[float] = []
-    blocks = elsewhere(drive, tmp_path, shares.append)
+    blocks = encoded_blocks(drive, tmp_path, shares.append)
     assert shares[0] >= 0.5
     assert shares[-1] == 1
     assert {path: path.stat().st_mtime_ns for path in files} == files
@@ -177,13 +177,13 @@ def test_what_was_encoded_before_a_kill_is_not_encoded_again(drive: Path, packs:
     assert places == [place for place in range(N_FRAMES) if place not in {7, 33}]
     assert [place for block in blocks for place in block.broken] == [7, 33]
     assert sum(block.shows_nothing.sum() for block in blocks) == 1
-    again: list[float] = []
-    elsewhere(drive, tmp_path, again.append)
-    assert again == [], "nothing is asked of the cluster"
+    later_shares: list[float] = []
+    encoded_blocks(drive, tmp_path, later_shares.append)
+    assert later_shares == [], "nothing is asked of the cluster"
     image = drive / "050.png"
     os.utime(image, ns=(1, 1))
-    elsewhere(drive, tmp_path, again.append)
-    assert len(again) == 2, "one pack, whose image is another now"
+    encoded_blocks(drive, tmp_path, later_shares.append)
+    assert len(later_shares) == 2, "one pack, whose image is another now"
 
 
 def test_a_worker_that_does_not_reach_the_drive_is_named(
@@ -195,4 +195,4 @@ def test_a_worker_that_does_not_reach_the_drive_is_named(
 
     monkeypatch.setattr(drives, "_Encoder", Unreached)
     with pytest.raises(UnavailableError, match="could not be encoded elsewhere"):
-        elsewhere(drive, tmp_path, lambda _: None)
+        encoded_blocks(drive, tmp_path, lambda _: None)

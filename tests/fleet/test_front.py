@@ -18,11 +18,11 @@ pytest.importorskip("ray", reason="the extra `ray` is not installed", exc_type=I
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
     from deepsimbad.fleet import backend, front
     from deepsimbad.fleet.backend import Backend, Gone
-    from deepsimbad.fleet.front import Front, added_up
+    from deepsimbad.fleet.front import Front, summed_metrics
     from deepsimbad.fleet.owners import Administrators
 
 
-def told(n_requests, n_sessions, ready):
+def metrics_text(n_requests, n_sessions, ready):
     return f"""# HELP deepsimbad_requests_total Requests.
 # TYPE deepsimbad_requests_total counter
 deepsimbad_requests_total{{status="200"}} {n_requests}
@@ -36,8 +36,10 @@ deepsimbad_ready {ready}
 
 
 def test_counts_are_added_and_what_all_see_alike_is_told_once():
-    assert added_up([told(3.0, 0.0, 1.0), told(4.0, 2.0, 1.0), told(5.0, 3.0, 1.0)]) == told(12.0, 5.0, 1.0)
-    assert added_up([told(3.0, 0.0, 0.0), told(4.0, 2.0, 1.0)]) == told(7.0, 2.0, 0.0)
+    assert summed_metrics(
+        [metrics_text(3.0, 0.0, 1.0), metrics_text(4.0, 2.0, 1.0), metrics_text(5.0, 3.0, 1.0)]
+    ) == metrics_text(12.0, 5.0, 1.0)
+    assert summed_metrics([metrics_text(3.0, 0.0, 0.0), metrics_text(4.0, 2.0, 1.0)]) == metrics_text(7.0, 2.0, 0.0)
 
 
 class Away(Backend):
@@ -45,11 +47,11 @@ class Away(Backend):
 
     def __init__(self):
         super().__init__(None)
-        self.asked = []
+        self.calls = []
 
     async def ask(self, method, scope, body):
-        self.asked.append((dict(scope["headers"])[b"idempotency-key"], body))
-        if len(self.asked) == 1:
+        self.calls.append((dict(scope["headers"])[b"idempotency-key"], body))
+        if len(self.calls) == 1:
             raise Gone
         return [{"type": "http.response.start", "status": 200, "headers": []}, {"type": "http.response.body"}]
 
@@ -57,23 +59,23 @@ class Away(Backend):
 @pytest.mark.parametrize(("patience_s", "status"), [(120.0, HTTPStatus.OK), (0.0, HTTPStatus.SERVICE_UNAVAILABLE)])
 def test_who_asks_while_both_owners_are_away_waits_a_while_with_one_key(monkeypatch, patience_s, status):
     monkeypatch.setattr(front, "_PATIENCE_S", patience_s)
-    asked = Front.__new__(Front)
+    fleet_front = Front.__new__(Front)
     admin = Away()
-    asked._administrators, asked._replicas = Administrators([admin]), [Away(), Away()]
+    fleet_front._administrators, fleet_front._replicas = Administrators([admin]), [Away(), Away()]
     path = f"/v1/sessions/{'0' * 32}/observations"
     scope = {"type": "http", "method": "POST", "path": path, "headers": [], "query_string": b""}
-    sent = []
+    messages = []
 
     async def send(message):
-        sent.append(message)
+        messages.append(message)
 
-    asyncio.run(asked._pass_on(scope, b"view", lambda: asyncio.sleep(120), send))
-    assert sent[0]["status"] == status
-    calls = [call for replica in asked._replicas for call in replica.asked]
+    asyncio.run(fleet_front._pass_on(scope, b"view", lambda: asyncio.sleep(120), send))
+    assert messages[0]["status"] == status
+    calls = [call for replica in fleet_front._replicas for call in replica.calls]
     assert len(calls) == (3 if patience_s else 2)
     assert {body for _, body in calls} == {b"view"}
     assert len({key for key, _ in calls}) == 1
-    assert admin.asked == []
+    assert admin.calls == []
 
 
 class Administering(Backend):
@@ -92,19 +94,19 @@ class Administering(Backend):
 
 def answered(path, *administering):
     """The status and body of the front's answer where these administer."""
-    asked = Front.__new__(Front)
-    asked._administrators, asked._replicas = Administrators(administering), []
-    sent = []
+    fleet_front = Front.__new__(Front)
+    fleet_front._administrators, fleet_front._replicas = Administrators(administering), []
+    messages = []
 
     async def send(message):
-        sent.append(message)
+        messages.append(message)
 
     scope = {"type": "http", "method": "GET", "path": path, "headers": [], "query_string": b""}
-    asyncio.run(asked._pass_on(scope, b"", lambda: asyncio.sleep(120), send))
-    headers, body = sent[0]["headers"], b"".join(message.get("body", b"") for message in sent[1:])
+    asyncio.run(fleet_front._pass_on(scope, b"", lambda: asyncio.sleep(120), send))
+    headers, body = messages[0]["headers"], b"".join(message.get("body", b"") for message in messages[1:])
     assert (b"x-request-id" in dict(headers)) == (path == "/readyz")
     assert [value for name, value in headers if name == b"content-length"] in ([], [str(len(body)).encode()])
-    return sent[0]["status"], body.decode()
+    return messages[0]["status"], body.decode()
 
 
 def ready(*damaged):
@@ -128,7 +130,7 @@ def health(is_ready, n_free, n_jobs):
 
 def test_of_several_that_administer_the_disk_and_readiness_of_the_worst_are_told():
     fine, full, broken = (
-        Administering(body=health(*told).encode()) for told in ((1.0, 90.0, 1.0), (1.0, 2.0, 2.0), (0.0, 50.0, 4.0))
+        Administering(body=health(*gauges).encode()) for gauges in ((1.0, 90.0, 1.0), (1.0, 2.0, 2.0), (0.0, 50.0, 4.0))
     )
     assert answered("/metrics", fine, full) == (200, health(1.0, 2.0, 3.0))
     assert answered("/metrics", fine, broken) == (200, health(0.0, 50.0, 5.0))
@@ -151,32 +153,36 @@ def test_who_does_not_answer_soon_hangs_no_answer_of_the_others(monkeypatch):
     assert (status, json.loads(body)["code"]) == (503, "unavailable")
     healthy = health(1.0, 90.0, 1.0)
     assert answered("/metrics", Administering(body=healthy.encode()), Stuck()) == (200, healthy)
-    asked = Front.__new__(Front)
-    asked._administrators, asked._replicas = Administrators([ready(), Stuck()]), []
+    fleet_front = Front.__new__(Front)
+    fleet_front._administrators, fleet_front._replicas = Administrators([ready(), Stuck()]), []
     last = {"type": "http.response.body", "body": b""}
-    asyncio.run(asyncio.wait_for(asked._before_last(last, asked._administrators.backends[0]), 60.0))
+    asyncio.run(asyncio.wait_for(fleet_front._before_last(last, fleet_front._administrators.backends[0]), 60.0))
 
 
 def test_a_key_that_is_not_a_domains_learns_nothing_of_its_administrator():
     key = ApiKey.new()
-    of_one = KeyRecord(key.key_id, "", KeyScope.LOCALIZE, key.secret_sha256, ("mine",), "2026-11-30", None, None)
+    record = KeyRecord(key.key_id, "", KeyScope.LOCALIZE, key.secret_sha256, ("mine",), "2026-11-30", None, None)
 
     class Elsewhere(Backend):
         async def ask(self, method, *arguments):
             return 7
 
-    asked = Front.__new__(Front)
-    asked._administrators, asked._replicas, asked._keys = Administrators([Elsewhere(None)]), [], KeyRing()
-    asked._keys.load(lambda: [of_one])
+    fleet_front = Front.__new__(Front)
+    fleet_front._administrators, fleet_front._replicas, fleet_front._keys = (
+        Administrators([Elsewhere(None)]),
+        [],
+        KeyRing(),
+    )
+    fleet_front._keys.load(lambda: [record])
 
-    def who(path):
+    def candidates(path):
         scope = {"path": path, "query_string": b"", "headers": [(b"x-api-key", key.text.encode())]}
-        return asyncio.run(asked._who(scope))[0]
+        return asyncio.run(fleet_front._candidates(scope))[0]
 
     with pytest.raises(UnavailableError, match="number 7"):
-        who("/v1/domains/mine")
+        candidates("/v1/domains/mine")
     for path in ("/v1/domains/theirs", "/v1/domains/theirs/coverage", "/v1/admin/domains/mine"):
-        assert who(path) == asked._administrators.backends, "any of them refuses"
+        assert candidates(path) == fleet_front._administrators.backends, "any of them refuses"
 
 
 class Started:
@@ -208,14 +214,14 @@ def test_the_front_listens_while_one_that_administers_is_away(monkeypatch, tmp_p
     monkeypatch.setattr(front.uvicorn, "Server", Listens)
 
     async def listening(*administrators):
-        asked = Front.__new__(Front)
+        fleet_front = Front.__new__(Front)
         settings = Settings(data_dir=tmp_path, host="127.0.0.1", port=0)
-        await asyncio.wait_for(asked.__init__(settings, administrators, [Started(), Started()]), 60.0)
-        address = await asked.address()
-        await asked._serving
-        for task in asked._watching:
+        await asyncio.wait_for(fleet_front.__init__(settings, administrators, [Started(), Started()]), 60.0)
+        address = await fleet_front.address()
+        await fleet_front._serving
+        for task in fleet_front._watching:
             task.cancel()
-        await asyncio.gather(*asked._watching, return_exceptions=True)
+        await asyncio.gather(*fleet_front._watching, return_exceptions=True)
         return address
 
     assert asyncio.run(listening(Started(), Started(is_there=False)))[1] > 0

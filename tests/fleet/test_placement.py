@@ -24,20 +24,20 @@ def test_every_pair_of_replicas_has_about_as_many_domains():
 
 
 def test_one_replica_more_takes_its_share_and_moves_nothing_else():
-    before, after = owners_of(4), owners_of(5)
-    moved = [domain for domain in DOMAINS if set(before[domain]) != set(after[domain])]
-    assert all(4 in after[domain] for domain in moved)
-    assert len(moved) == pytest.approx(2 / 5 * len(DOMAINS), rel=0.2)
+    of_four, of_five = owners_of(4), owners_of(5)
+    moved_domains = [domain for domain in DOMAINS if set(of_four[domain]) != set(of_five[domain])]
+    assert all(4 in of_five[domain] for domain in moved_domains)
+    assert len(moved_domains) == pytest.approx(2 / 5 * len(DOMAINS), rel=0.2)
 
 
 def test_a_session_lives_with_its_domain_half_of_them_with_each_owner():
     digits = domain_digits("ready")
-    both = owners(digits, 4)
+    domain_owners = owners(digits, 4)
     firsts = Counter()
     for number in range(400):
-        placed = session_owners(f"{digits}{number:024x}", 4)
-        assert set(placed) == set(both)
-        firsts[placed[0]] += 1
+        replicas = session_owners(f"{digits}{number:024x}", 4)
+        assert set(replicas) == set(domain_owners)
+        firsts[replicas[0]] += 1
     assert min(firsts.values()) > 150
 
 

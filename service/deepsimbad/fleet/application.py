@@ -1,4 +1,4 @@
-"""The fleet as an application of Ray Serve: those that administer, replicas that have the domains, the front."""
+"""The fleet as an application of Ray Serve: administrators, replicas that have the domains, the front."""
 
 import signal
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from deepsimbad.fleet.replica import MakeRunJob, Replica, administrator_name, re
 from deepsimbad.settings import Settings, trace_settings
 
 NAME = "deepsimbad"
-_EACH: dict[str, Any] = {
+_DEPLOYMENT: dict[str, Any] = {
     "num_replicas": 1,  # of every name
     "max_ongoing_requests": 100_000,  # the door of the application counts
     "health_check_period_s": 1.0,
@@ -30,13 +30,13 @@ _EACH: dict[str, Any] = {
 class Encoders:
     """How many processes have the networks for all; with none every replica has its own."""
 
-    asked: int | None = None  # None: one where it has a GPU; on processors it costs more than it spares
-    num_gpus: float = 0.0  # that each of them takes of its machine's, as Ray counts them
+    requested: int | None = None  # None: one where it has a GPU; on processors it costs more than it saves
+    num_gpus: float = 0.0  # share of its machine's GPUs that each of them takes, as Ray counts them
 
     @property
     def number(self) -> int:
         """How many there are."""
-        return int(self.num_gpus > 0) if self.asked is None else self.asked
+        return int(self.num_gpus > 0) if self.requested is None else self.requested
 
 
 def build(
@@ -46,12 +46,12 @@ def build(
     encoders: Encoders = Encoders(),
     n_administrators: int = 1,
 ) -> serve.Application:
-    """What `serve.run` takes; every part is restarted where its process ends.
+    """The fleet as `serve.run` takes it; a part whose process ends is started again.
 
     Args:
-        settings: As `Replica`.
+        settings: See `Replica`.
         n_replicas: Processes that have domains.
-        make_run_job: As `Replica`.
+        make_run_job: See `Replica`.
         encoders: Processes that have networks.
         n_administrators: Processes that administer, each some of the domains.
     """
@@ -61,30 +61,30 @@ def build(
             "one machine, file:///folder",
             setting="map_store",
         )
-    whole = serve.deployment(**_EACH)(Replica)
+    replica = serve.deployment(**_DEPLOYMENT)(Replica)
     encoder = None
     if encoders.number:
-        takes = {**_EACH["ray_actor_options"], "num_gpus": encoders.num_gpus}
-        of_networks = {**_EACH, "num_replicas": encoders.number, "ray_actor_options": takes}
-        encoder = serve.deployment(**of_networks)(Encoder).options(name="encoder").bind(settings)
-    given = settings, n_replicas, n_administrators, encoder
-    admin = whole.options(name=administrator_name(0)).bind(*given, None, 0, make_run_job)
-    others = [
-        whole.options(name=administrator_name(number)).bind(*given, admin, number, make_run_job)
+        actor_options = {**_DEPLOYMENT["ray_actor_options"], "num_gpus": encoders.num_gpus}
+        encoder_options = {**_DEPLOYMENT, "num_replicas": encoders.number, "ray_actor_options": actor_options}
+        encoder = serve.deployment(**encoder_options)(Encoder).options(name="encoder").bind(settings)
+    arguments = settings, n_replicas, n_administrators, encoder
+    admin = replica.options(name=administrator_name(0)).bind(*arguments, None, 0, make_run_job)
+    other_admins = [
+        replica.options(name=administrator_name(number)).bind(*arguments, admin, number, make_run_job)
         for number in range(1, n_administrators)
     ]
-    replicas = [whole.options(name=replica_name(number)).bind(*given, admin) for number in range(n_replicas)]
-    return serve.deployment(**_EACH)(Front).options(name="front").bind(settings, [admin, *others], replicas)
+    replicas = [replica.options(name=replica_name(number)).bind(*arguments, admin) for number in range(n_replicas)]
+    return serve.deployment(**_DEPLOYMENT)(Front).options(name="front").bind(settings, [admin, *other_admins], replicas)
 
 
 def start(fleet: serve.Application, name: str = NAME) -> DeploymentHandle[Front]:
-    """Start what `build` gives in the cluster that this process has joined; returns when it answers."""
+    """Start a fleet that `build` made in the cluster that this process has joined; returns when it answers."""
     serve.start(proxy_location="Disabled")  # the front listens itself
     return serve.run(fleet, name=name, route_prefix=None)
 
 
 def wait() -> None:
-    """Until interrupted or told to end, and let every process finish what it has begun."""
+    """Wait until interrupted or terminated, then let every process finish what it has begun."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         signal.pause()
@@ -93,7 +93,7 @@ def wait() -> None:
 
 
 def from_yaml(arguments: dict[str, Any]) -> serve.Application:
-    """What `serve deploy serve.yaml` asks for: the options of `deepsimbad ray serve`, any setting by its name."""
+    """The fleet for `serve deploy serve.yaml`, from options of `deepsimbad ray serve` and any setting by its name."""
     n_replicas, n_administrators = int(arguments.pop("replicas", 4)), int(arguments.pop("administrators", 1))
     encoders = Encoders(arguments.pop("encoders", None), float(arguments.pop("encoder_gpus", 0.0)))
     settings = trace_settings(**arguments).settings

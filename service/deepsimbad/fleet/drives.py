@@ -1,8 +1,8 @@
 """Drives encoded by many machines with Ray Data, in packs that are kept, so that a run that was killed goes on.
 
 Workers read the images themselves: the drive must lie where all of them reach it, under one path. One that lies in an
-object store is copied to a folder here, file by file, as far as it changed; a process on another machine copies the
-images that it is to encode, to the same place, and they are the same files: each has its object's time.
+object store is copied to a local folder, file by file, as far as it changed; a process on another machine copies the
+images that it is to encode to the same path, and they are the same files: each has its object's time.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ from deepsimbad_client.recordings.folder import FolderRecording
 
 _FRAMES_A_PACK = 256  # about 1 MB of encodings, and as much as a kill may cost every worker
 _URL = re.compile(r"((?:s3|gs|az)://[^#]+?)/*(#.*)?")
-_AT_ONCE = 16  # requests
+_AT_ONCE = 16  # requests for objects
 
 
 def encoded_elsewhere(
@@ -52,26 +52,26 @@ def encoded_elsewhere(
     Every worker takes as many processors as `compute` has threads, one where that is left open.
 
     Args:
-        evaluator: Tells how many images share a batch, wherever they are encoded.
+        evaluator: Says how many images share a batch, wherever they are encoded.
         configuration: The evaluator's.
-        folder: Where packs of encoded frames are kept until the map is sealed; those of before are not made again.
-        on_progress: Told 0..1; what it raises ends the run, and what was encoded stays.
+        folder: Where packs of encoded frames are kept until the map is sealed; packs there are not made again.
+        on_progress: Takes the share done, 0..1; an error that it raises ends the run, and encoded packs stay.
 
     Raises:
         UnavailableError: A worker failed, as where it does not reach the drive.
     """
     recording = as_taken(recording, evaluator.forms)
     blocks = places_of_blocks(len(recording.frames), evaluator)
-    n_together = max(1, _FRAMES_A_PACK // max(1, len(blocks[0])))
-    packs = [blocks[first : first + n_together] for first in range(0, len(blocks), n_together)]
-    about = _identity(recording, evaluator, configuration, max_pixels)
-    files = [folder / about / f"{pack[0].start:09d}.npz" for pack in packs]
+    n_blocks = max(1, _FRAMES_A_PACK // max(1, len(blocks[0])))
+    packs = [blocks[first : first + n_blocks] for first in range(0, len(blocks), n_blocks)]
+    identity = _identity(recording, evaluator, configuration, max_pixels)
+    files = [folder / identity / f"{pack[0].start:09d}.npz" for pack in packs]
     files[0].parent.mkdir(parents=True, exist_ok=True)
-    missing = [at for at, pack in enumerate(packs) if _kept(files[at], recording, pack) is None]
+    missing = [number for number, pack in enumerate(packs) if _stored_block(files[number], recording, pack) is None]
     if missing:
         compute = dataclasses.replace(compute, largest_batch=len(blocks[0]), n_threads=compute.n_threads or 1)
         n_workers = min(len(missing), max(1, int(ray.cluster_resources().get("CPU", 1)) // compute.n_threads))
-        encoded = ray.data.from_items([{"pack": at} for at in missing], override_num_blocks=len(missing)).map(
+        encoded = ray.data.from_items([{"pack": number} for number in missing], override_num_blocks=len(missing)).map(
             _Encoder,
             fn_constructor_args=(ray.put((recording, packs)), configuration, compute, max_pixels),
             num_cpus=compute.n_threads,
@@ -88,8 +88,8 @@ def encoded_elsewhere(
                 on_progress(n_done / len(packs))
         except ray.exceptions.RayError as error:
             raise UnavailableError(f"{recording.name} could not be encoded elsewhere: {_last_line(error)}") from error
-    for at, pack in enumerate(packs):
-        block = _kept(files[at], recording, pack)
+    for number, pack in enumerate(packs):
+        block = _stored_block(files[number], recording, pack)
         if block is None:
             raise UnavailableError(f"{recording.name} changed while it was encoded: begin again")
         yield block
@@ -100,12 +100,12 @@ class _Encoder:
 
     def __init__(
         self,
-        given: "ray.ObjectRef[tuple[Recording, Sequence[Sequence[range]]]]",
+        drive: "ray.ObjectRef[tuple[Recording, Sequence[Sequence[range]]]]",
         configuration: dict[str, Any],
         compute: Compute,
         max_pixels: int,
     ) -> None:
-        self._recording, self._packs = ray.get(given)
+        self._recording, self._packs = ray.get(drive)
         self._evaluator = make_evaluator(evaluator_config(configuration), compute)
         self._max_pixels = max_pixels
 
@@ -127,8 +127,8 @@ class _Encoder:
         return {"pack": row["pack"], "content": content.getvalue()}
 
 
-def _kept(file: Path, recording: Recording, pack: Sequence[range]) -> EncodedBlock | None:
-    """A pack that was encoded before, None where there is none of the frames as they are now."""
+def _stored_block(file: Path, recording: Recording, pack: Sequence[range]) -> EncodedBlock | None:
+    """A pack that was encoded before; None: there is none, or the frames have changed since."""
     try:
         with np.load(file) as arrays:
             if str(arrays["stamps"]) != _stamps(recording, pack):
@@ -149,13 +149,13 @@ def _stamps(recording: Recording, pack: Sequence[range]) -> str:
 
 
 def _identity(recording: Recording, evaluator: Evaluator, configuration: dict[str, Any], max_pixels: int) -> str:
-    """What encodings follow from, beside the frames' files."""
-    how = dataclasses.replace(
+    """16 hex digits that stand for all that encodings depend on beside the frames' files."""
+    reading = dataclasses.replace(
         recording, frames=(), left_out_names={}, remarks=(), full_recording=None, n_before_slice=None
     )
     batch = evaluator.largest_batch
-    about = [release(), repr(how), configuration, evaluator.weights_sha256, evaluator.input_size, batch, max_pixels]
-    return hashlib.sha256(json.dumps(about, default=str, sort_keys=True).encode()).hexdigest()[:16]
+    parts = [release(), repr(reading), configuration, evaluator.weights_sha256, evaluator.input_size, batch, max_pixels]
+    return hashlib.sha256(json.dumps(parts, default=str, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _last_line(error: Exception) -> str:
@@ -164,7 +164,7 @@ def _last_line(error: Exception) -> str:
 
 
 def joined(address: str | None) -> None:
-    """Join a cluster, or begin one of this machine; one that this process is in already stays."""
+    """Join a cluster, or start one on this machine, unless this process is in one already."""
     if not ray.is_initialized():
         os.environ.setdefault("RAY_DATA_DISABLE_PROGRESS_BARS", "1")
         ray.init(address, log_to_driver=False, logging_level="WARNING")
@@ -179,10 +179,10 @@ class StoredDrive:
     folder: Path
 
     def copy(self, on_progress: Callable[[float], None]) -> None:
-        """Make the copy what is there now; folders inside are not looked at.
+        """Bring the copy up to date with the objects; folders inside are not looked at.
 
         Raises:
-            SourceError: There is nothing.
+            SourceError: There are no objects.
             UnavailableError, MissingPackageError, SettingsError: As `Objects`.
         """
         objects = Objects.open(self.url)
@@ -198,24 +198,24 @@ class StoredDrive:
                 on_progress((n_done + 1) / len(changed))
 
     def of(self, recording: FolderRecording) -> FolderRecording:
-        """The copy's recording, for processes that may lack it."""
-        known = {each.name: getattr(recording, each.name) for each in dataclasses.fields(recording)}
-        return _FetchedFolder(**known, url=self.url)
+        """The copy's recording, for processes that may lack its files."""
+        fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
+        return _FetchedFolder(**fields, url=self.url)
 
 
 def stored_drive(source: str, folder: Path) -> tuple[StoredDrive, str] | None:
-    """What a SOURCE names in an object store, copied below a folder, and the slice behind it; None: a path."""
+    """The drive that a SOURCE names in an object store, copied below a folder, and its slice; None: it is a path."""
     match = _URL.fullmatch(source)
     if match is None:
         return None
-    url, part = match[1], match[2] or ""
+    url, slice_text = match[1], match[2] or ""
     digest = hashlib.sha256(url.encode()).hexdigest()[:16]
-    return StoredDrive(url, folder / digest / url.rpartition("/")[2]), part
+    return StoredDrive(url, folder / digest / url.rpartition("/")[2]), slice_text
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _FetchedFolder(FolderRecording):
-    """Images that are copied where they are missing."""
+    """A folder's recording whose images are copied from the object store where they are missing."""
 
     url: str
 

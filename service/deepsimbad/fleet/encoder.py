@@ -16,7 +16,7 @@ from deepsimbad.settings import Settings
 
 
 class Encoder:
-    """The deployment, asked as an `engine.distant.Encoder`: evaluators as they are asked for, and one worker."""
+    """The deployment behind `engine.distant.Encoder`: evaluators, made when first asked for, and one worker."""
 
     def __init__(self, settings: Settings) -> None:
         configure_logging(settings.log_level)
@@ -35,7 +35,7 @@ class Encoder:
         await asyncio.sleep(seconds)
 
     async def ask(self, method: str, *arguments: Any) -> Any:
-        """What a method answers, or the error of ours that it raises: Serve's own mean that a process has ended."""
+        """A method's answer, or the error of ours that it raises: errors that Serve raises are of ended processes."""
         try:
             return await getattr(self, method)(*arguments)
         except DeepSimbadError as error:
@@ -58,7 +58,7 @@ class Encoder:
 
 
 class AskedEncoder:
-    """`engine.distant.Encoder` from a process that asks the deployment, of which an event loop has the handle."""
+    """`engine.distant.Encoder` that asks the deployment, from any thread, through a handle of an event loop."""
 
     def __init__(self, backend: Backend, loop: asyncio.AbstractEventLoop) -> None:
         self._backend, self._loop = backend, loop

@@ -37,8 +37,8 @@ _PASSED = (  # of a request's scope
     *("scheme", "client", "server", "root_path"),
 )
 
-_PATIENCE_S = 10.0  # that a request waits where both owners are away; one that has ended is back in half of it
-_OF_EACH = {  # gauges
+_PATIENCE_S = 10.0  # longest wait of a request whose owners are both away; one that ended is back in half of it
+_SUMMED_GAUGES = {
     "requests_in_flight",
     "inference_queue",
     "loaded_maps",
@@ -47,7 +47,7 @@ _OF_EACH = {  # gauges
     "map_store_failing",
     "jobs",
 }
-_OF_WORST = re.compile(
+_HEALTH_GAUGES = re.compile(
     r"^deepsimbad_(?:ready (?P<ready>\S+)|data_dir_free_bytes (?P<free>\S+)|data_dir_size_bytes (?P<size>\S+))$",
     re.MULTILINE,
 )
@@ -72,8 +72,8 @@ class Front:
         self._replicas = [Backend(handle) for handle in replicas]
         backends = [*self._administrators.backends, *self._replicas]
         self._watching = [asyncio.create_task(backend.watch()) for backend in backends]
-        needed = [backends[0], *self._replicas]  # the keys, and who serves robots; another may be away for long
-        while any(backend.gone is None for backend in needed):
+        required = [backends[0], *self._replicas]  # the keys, and who serves robots; another may be away for long
+        while any(backend.process_end is None for backend in required):
             await asyncio.sleep(0.05)
         self._keys = KeyRing()
         await asyncio.to_thread(self._keys.load, keys_of(administrators[0]))
@@ -88,20 +88,20 @@ class Front:
         self._serving = asyncio.create_task(server.serve([listening]))
 
     async def address(self) -> tuple[str, int]:
-        """Where it listens."""
+        """The host and port where it listens."""
         return self._address
 
     async def reread_keys(self) -> None:
-        """Let the keys count as they are by now."""
+        """Read the keys anew."""
         await self._keys.reread()
 
     def check_health(self) -> None:
-        """Raise where nothing listens any more."""
+        """Raise RuntimeError where nothing listens any more."""
         if self._serving.done():
             raise RuntimeError("the HTTP server has ended")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, as ASGI has it."""
+        """Answer one request of ASGI's."""
         if scope["type"] != "http":
             return
         root = self._settings.root_path
@@ -116,12 +116,12 @@ class Front:
             pass
 
     async def _pass_on(self, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
-        passed = {name: scope[name] for name in _PASSED if name in scope}
+        passed_scope = {name: scope[name] for name in _PASSED if name in scope}
         headers = dict(scope["headers"])
         if scope["method"] == "POST" and b"idempotency-key" not in headers:
-            passed["headers"] = [*scope["headers"], (b"idempotency-key", secrets.token_hex(16).encode())]
-        answering = asyncio.create_task(self._answer(passed, body, receive, send))
-        leaving = asyncio.create_task(_left(receive))
+            passed_scope["headers"] = [*scope["headers"], (b"idempotency-key", secrets.token_hex(16).encode())]
+        answering = asyncio.create_task(self._answer(passed_scope, body, receive, send))
+        leaving = asyncio.create_task(_sender_gone(receive))
         await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
         leaving.cancel()
         if not answering.done() and scope["method"] in {"GET", "HEAD"}:  # what changes something is finished
@@ -136,22 +136,22 @@ class Front:
             await self._readiness(scope, receive, send)
             return
         try:
-            who, patience_s = await self._who(scope)
+            candidates, patience_s = await self._candidates(scope)
         except UnavailableError as error:
             await _refuse(scope, error, receive, send)
             return
-        until = asyncio.get_running_loop().time() + patience_s
-        while not await self._is_answered(who, scope, body, send):
-            if asyncio.get_running_loop().time() >= until:
-                what = "those that know the domain are away this moment: try again"
-                await _refuse(scope, UnavailableError(what, retry_after_s=AWAY_S), receive, send)
+        deadline_s = asyncio.get_running_loop().time() + patience_s
+        while not await self._is_answered(candidates, scope, body, send):
+            if asyncio.get_running_loop().time() >= deadline_s:
+                message = "those that know the domain are away this moment: try again"
+                await _refuse(scope, UnavailableError(message, retry_after_s=AWAY_S), receive, send)
                 return
             await asyncio.sleep(0.05)
 
-    async def _is_answered(self, who: Sequence[Backend], scope: Scope, body: bytes, send: Send) -> bool:
-        """Let the first that is there answer; False: all are away, or ended under it."""
+    async def _is_answered(self, candidates: Sequence[Backend], scope: Scope, body: bytes, send: Send) -> bool:
+        """Let the first candidate that is there answer; False: all are away, or ended during the request."""
         has_begun = False
-        for backend in who:
+        for backend in candidates:
             backend.n_calls += 1
             try:
                 if scope["method"] not in {"GET", "HEAD"}:  # these alone may be long
@@ -173,23 +173,24 @@ class Front:
         return False
 
     async def _metrics(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The counts of all that are there."""
-        administering = await self._asked(self._administrators.backends, scope)
-        answers = administering + await self._asked(self._replicas, scope)
+        """Answer with the summed metrics of all processes that are there."""
+        administrator_answers = await self._answers_of(self._administrators.backends, scope)
+        answers = administrator_answers + await self._answers_of(self._replicas, scope)
         if (refusal := _refusal(answers)) is not None:
             for message in refusal:
                 await send(message)
             return
         texts = [_body(answer).decode() for answer in answers]
-        texts[: len(administering)] = sorted(texts[: len(administering)], key=_health)  # who is worst off is believed
-        await Response(added_up(texts), media_type=CONTENT_TYPE_LATEST)(scope, receive, send)
+        n_administrators = len(administrator_answers)
+        texts[:n_administrators] = sorted(texts[:n_administrators], key=_health)  # the worst first, which is believed
+        await Response(summed_metrics(texts), media_type=CONTENT_TYPE_LATEST)(scope, receive, send)
 
     async def _readiness(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Whether all that administer are ready, and the damaged maps that any of them has met."""
-        answers = await self._asked(self._administrators.backends, scope)
+        """Answer whether all administrators are ready, and with the damaged maps that any of them has met."""
+        answers = await self._answers_of(self._administrators.backends, scope)
         if len(answers) < len(self._administrators.backends):
-            what = "one of those that administer is away this moment"
-            await _refuse(scope, UnavailableError(what, retry_after_s=AWAY_S, faults=[what]), receive, send)
+            problem = "one of those that administer is away this moment"
+            await _refuse(scope, UnavailableError(problem, retry_after_s=AWAY_S, faults=[problem]), receive, send)
             return
         if scope["method"] == "GET" and _refusal(answers) is None:
             documents = [json.loads(_body(answer)) for answer in answers]
@@ -203,46 +204,48 @@ class Front:
         for message in _refusal(answers) or answers[0]:
             await send(message)
 
-    async def _asked(self, backends: Sequence[Backend], scope: Scope) -> list[list[Message]]:
-        """The answers of those that are there."""
-        asked = (backend.ask_briefly("ask", scope, b"") for backend in backends)
-        return [answer for answer in await asyncio.gather(*asked, return_exceptions=True) if isinstance(answer, list)]
+    async def _answers_of(self, backends: Sequence[Backend], scope: Scope) -> list[list[Message]]:
+        """The answers of the processes that are there."""
+        calls = (backend.ask_briefly("ask", scope, b"") for backend in backends)
+        return [answer for answer in await asyncio.gather(*calls, return_exceptions=True) if isinstance(answer, list)]
 
     async def _before_last(self, message: Message, backend: Backend) -> None:
-        """Before an answer of one that administers is whole, let all others see what it may have changed."""
-        administering = self._administrators.backends
-        if backend in administering and message["type"] == "http.response.body" and not message.get("more_body", False):
-            following = [each.ask_briefly("follow") for each in administering if each is not backend]
-            following += [replica.ask("follow") for replica in self._replicas]  # who may have a large map to load
-            await asyncio.gather(*following, return_exceptions=True)
+        """Before an administrator's answer is complete, let all other processes see what it may have changed."""
+        administrators = self._administrators.backends
+        is_last = message["type"] == "http.response.body" and not message.get("more_body", False)
+        if is_last and backend in administrators:
+            calls = [other.ask_briefly("follow") for other in administrators if other is not backend]
+            calls += [replica.ask("follow") for replica in self._replicas]  # which may have a large map to load
+            await asyncio.gather(*calls, return_exceptions=True)
 
-    async def _who(self, scope: Scope) -> tuple[Sequence[Backend], float]:
-        """Who may answer, the better one first, and how many seconds it may be waited for; raises UnavailableError."""
+    async def _candidates(self, scope: Scope) -> tuple[Sequence[Backend], float]:
+        """Who may answer, the preferred one first, and how many seconds to wait for one; raises UnavailableError."""
         word = dict(scope["headers"]).get(b"idempotency-key")
-        placed = place(scope["path"], len(self._replicas), _key_id(scope), word and word.decode("latin-1"))
-        if placed is None:  # who asks for health is told at once
+        placement = place(scope["path"], len(self._replicas), _key_id(scope), word and word.decode("latin-1"))
+        if placement is None:  # health checks, too, are answered without waiting
             if not self._opens(scope):  # and learns nothing of domains
                 return self._administrators.backends, 0.0
             return await self._administrators.of(scope["path"], scope["query_string"]), 0.0
-        backends = [self._replicas[number] for number in placed[0]]
-        return backends if placed[1] else sorted(backends, key=lambda backend: backend.n_calls), _PATIENCE_S
+        backends = [self._replicas[number] for number in placement[0]]
+        return backends if placement[1] else sorted(backends, key=lambda backend: backend.n_calls), _PATIENCE_S
 
     def _opens(self, scope: Scope) -> bool:
-        """Whether the key that is presented, if one is asked, reaches so far."""
+        """Whether the path needs no key, or the key that is presented reaches it."""
         try:
-            needed = self._keys.scope_for(scope["path"])
-            if needed is not None:
-                check_reach(self._keys.holder(presented_key(scope)), scope["path"], needed)
-        except (UnauthorizedError, ForbiddenError, UnavailableError):  # whoever is asked says so
+            required_scope = self._keys.scope_for(scope["path"])
+            if required_scope is not None:
+                check_reach(self._keys.holder(presented_key(scope)), scope["path"], required_scope)
+        except (UnauthorizedError, ForbiddenError, UnavailableError):  # the administrator answers so
             return False
         return True
 
 
 class Bodies:
-    """Bodies on their way through, had whole before a replica is asked, in the room the service has.
+    """Request bodies, read whole before a replica is asked, within the memory that the service's setting allows.
 
-    Whoever sends slowly takes memory for what came, and together they take no more than the setting. A batch lies on
-    the disk until all of it has come, as in the service; then one at a time is in memory. `keys` tells whose are read.
+    A slow sender takes memory for what has come alone, and all senders together no more than the setting. A batch lies
+    on the disk until all of it has come, as in the service; then one at a time is in memory. Bodies sent with a key
+    that `keys` does not know are not read.
     """
 
     def __init__(self, settings: Settings, keys: KeyRing) -> None:
@@ -254,19 +257,19 @@ class Bodies:
 
     @asynccontextmanager
     async def of(self, scope: Scope, receive: Receive) -> AsyncGenerator[bytes]:
-        """The body of a request; of one that is refused by its head nothing, of one too long so much that it is seen.
+        """The body of a request; empty where its head is refused, and cut behind its limit where it is too long.
 
         Raises:
-            OverloadedError: There is no room for it.
-            UnavailableError: Nor on the disk.
+            OverloadedError: There is no room for it in memory.
+            UnavailableError: There is no room for it on the disk.
             ClientDisconnect: Its sender has gone before all of it had come.
         """
         headers = dict(scope["headers"])
-        most, is_batch = max_body_bytes(scope, headers, self._settings)
-        declared = headers.get(b"content-length", b"0")
-        n_declared = int(declared[:20]) if declared.isdigit() else 0
-        parts = _parts(scope, receive, most)
-        if n_declared > most or not self._is_let_in(scope):
+        max_bytes, is_batch = max_body_bytes(scope, headers, self._settings)
+        content_length = headers.get(b"content-length", b"0")
+        n_declared = int(content_length[:20]) if content_length.isdigit() else 0
+        parts = _parts(scope, receive, max_bytes)
+        if n_declared > max_bytes or not self._is_let_in(scope):
             yield b""
         elif is_batch:
             folder = Path(tempfile.gettempdir())
@@ -281,21 +284,21 @@ class Bodies:
                 yield body
         else:
             self._room.check(max(0, n_declared - FREE_BYTES))
-            came, n_held = bytearray(), 0
+            received, n_held = bytearray(), 0
             try:
                 async for part in parts:
-                    came += part
-                    if (n_more := len(came) - FREE_BYTES - n_held) > 0:
+                    received += part
+                    if (n_more := len(received) - FREE_BYTES - n_held) > 0:
                         self._room.take(n_more)
                         n_held += n_more
-                body = bytes(came)
-                del came
+                body = bytes(received)
+                del received
                 yield body
             finally:
                 self._room.give_back(n_held)
 
     def _is_let_in(self, scope: Scope) -> bool:
-        """Whether a replica would read the body of who comes with this key; it judges all that a key is for."""
+        """Whether a replica would read a body sent with this key; the replica judges what the key may do."""
         try:
             if self._keys.scope_for(scope["path"]) is not None:
                 self._keys.holder(presented_key(scope))
@@ -306,18 +309,18 @@ class Bodies:
         return True
 
 
-async def _parts(scope: Scope, receive: Receive, most: int) -> AsyncIterator[bytes]:
-    """A body as it comes, until it is longer than it may be; raises ClientDisconnect."""
+async def _parts(scope: Scope, receive: Receive, max_bytes: int) -> AsyncIterator[bytes]:
+    """A body in parts as they come, until it is longer than `max_bytes`; raises ClientDisconnect."""
     n_bytes = 0
     async for part in Request(scope, receive).stream():
         n_bytes += len(part)
         yield part
-        if n_bytes > most:
+        if n_bytes > max_bytes:
             return
 
 
 async def _refuse(scope: Scope, error: DeepSimbadError, receive: Receive, send: Send) -> None:
-    """Answer in place of a replica."""
+    """Answer with an error in place of a replica."""
     scope["state"] = {"request_id": secrets.token_hex(8)}
     headers = [(b"x-request-id", scope["state"]["request_id"].encode()), (b"cache-control", b"no-store")]
 
@@ -330,7 +333,7 @@ async def _refuse(scope: Scope, error: DeepSimbadError, receive: Receive, send: 
 
 
 def _refusal(answers: Iterable[list[Message]]) -> list[Message] | None:
-    """The first answer that is none."""
+    """The first answer whose status is not 200; None: there is none."""
     return next((answer for answer in answers if answer[0]["status"] != HTTPStatus.OK), None)
 
 
@@ -339,15 +342,18 @@ def _body(answer: Iterable[Message]) -> bytes:
 
 
 def _health(text: str) -> tuple[float, float]:
-    """Whether one that administers is ready, and the share of its disk that is free, as it tells Prometheus."""
-    told = {
-        name: float(value) for found in _OF_WORST.finditer(text) for name, value in found.groupdict().items() if value
+    """Whether an administrator is ready (1 or 0), and the share of its disk that is free, from its metrics."""
+    gauges = {
+        name: float(value)
+        for match in _HEALTH_GAUGES.finditer(text)
+        for name, value in match.groupdict().items()
+        if value
     }
-    return told.get("ready", 0.0), told.get("free", 0.0) / told.get("size", 1.0)
+    return gauges.get("ready", 0.0), gauges.get("free", 0.0) / gauges.get("size", 1.0)
 
 
 def _key_id(scope: Scope) -> str | None:
-    """Of the key that is presented; whether it opens anything is not asked here."""
+    """The id of the key that is presented, which is not checked here; None: there is none, or no such form."""
     try:
         key = ApiKey.parse(presented_key(scope))
     except UnauthorizedError:
@@ -355,16 +361,16 @@ def _key_id(scope: Scope) -> str | None:
     return key.key_id if key else None
 
 
-async def _left(receive: Receive) -> None:
+async def _sender_gone(receive: Receive) -> None:
     """Return once the sender has gone."""
     while (await receive())["type"] != "http.disconnect":
         pass
 
 
-def added_up(texts: Iterable[str]) -> str:
-    """What several processes tell Prometheus as if they were one.
+def summed_metrics(texts: Iterable[str]) -> str:
+    """The metrics of several processes as if they were one.
 
-    What is counted, and what each has of its own, is added; of what all of them see alike the first is believed.
+    Counts and the gauges that each process has of its own are added; of gauges that all see alike the first is taken.
     """
     families: dict[str, dict[str, float]] = {}
     for text in texts:
@@ -372,7 +378,7 @@ def added_up(texts: Iterable[str]) -> str:
         for line in text.splitlines():
             if line.startswith("# TYPE"):
                 _, _, family, kind = line.split()
-                adds = kind != "gauge" or family.removeprefix("deepsimbad_") in _OF_EACH
+                adds = kind != "gauge" or family.removeprefix("deepsimbad_") in _SUMMED_GAUGES
                 samples = families.setdefault(f"{heading}{line}\n", {})
             elif line.startswith("#"):
                 heading = f"{line}\n"

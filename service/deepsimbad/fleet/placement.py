@@ -16,7 +16,7 @@ _OF_SESSION = re.compile(r"/v1/sessions/([^/]+)(/.*)?")
 
 
 def owners(digits: str, n_replicas: int) -> tuple[int, ...]:
-    """The replicas that a domain lives with, by the digits that tell it; the first is nobody's more than the second."""
+    """The replicas that a domain lives with, by the digits of its name's digest, in no order of importance."""
     weights = {
         replica: blake2b(f"{replica} {digits}".encode("utf-8", "surrogatepass")).digest()
         for replica in range(n_replicas)
@@ -34,15 +34,15 @@ def session_owners(session_id: str, n_replicas: int) -> tuple[int, ...]:
 def place(
     path: str, n_replicas: int, key_id: str | None = None, word: str | None = None
 ) -> tuple[tuple[int, ...], bool] | None:
-    """Who answers a decoded path, and whether in this order; None: one that administers.
+    """The replicas that may answer a decoded path, and whether in this order; None: an administrator answers.
 
     Args:
         path: As it is routed.
-        n_replicas: That there are.
+        n_replicas: Of the fleet.
         key_id: Of the API key that is presented, if any.
-        word: The idempotency key; with both of them the id of a session that is begun is known.
+        word: The idempotency key; from it and `key_id` follows the id of a session that is begun.
     """
-    if path == "/v1/localizations":  # whoever is asked asks the owners
+    if path == "/v1/localizations":  # any replica asks the owners
         return tuple(range(n_replicas)), False
     if (of_session := _OF_SESSION.fullmatch(path)) is not None:
         return session_owners(of_session[1], n_replicas), True

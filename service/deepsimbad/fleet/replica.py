@@ -1,4 +1,4 @@
-"""One service of the fleet: the whole application in a process of Ray Serve's, asked by ASGI in place of a socket."""
+"""One service of the fleet: the whole application in a process of Ray Serve's, called by ASGI in place of a socket."""
 
 import asyncio
 import fcntl
@@ -46,31 +46,31 @@ from deepsimbad.store.sessions import ListedSession, SessionRecord
 from deepsimbad.store.shared_catalog import SharedCatalog
 from deepsimbad.store.shared_sessions import SharedSessionStore
 
-_START_S = 60.0  # that a replica waits for the one that administers, whose keys it reads
+_START_S = 60.0  # longest wait of a replica for the administrator whose keys it reads
 _THREADS = 64
-_MESSAGES = 8  # of an answer that may wait to be fetched
+_MESSAGES = 8  # parts of an answer that may wait to be fetched
 _FOLDER_PREFIX = "deepsimbad-replica-"  # before the process's number
 
 MakeRunJob: TypeAlias = Callable[[Path], RunJob]
 
 
 def replica_name(number: int) -> str:
-    """Of the deployment: who answers for a domain is told by name, so that a restart moves nothing."""
+    """Name of a replica's deployment; a domain belongs to names, so that a restart moves nothing."""
     return f"domains-{number}"
 
 
 def administrator_name(number: int) -> str:
-    """Of the deployment of one that administers; of one alone as when there could be no other."""
+    """Name of an administrator's deployment; the first is called as when there was only one."""
     return f"admin-{number}" if number else "admin"
 
 
 def administrator_folder(data_dir: Path, number: int) -> Path:
-    """The data directory of one that administers: the first has the fleet's own, the others theirs in it."""
+    """An administrator's data directory: the first has the fleet's own, the others theirs in it."""
     return data_dir / "administrators" / str(number) if number else data_dir
 
 
 def keys_of(admin: "DeploymentHandle[Replica]") -> Callable[[], Sequence[KeyRecord]]:
-    """What reads the keys of the one that has them, in a thread of its own."""
+    """A function that reads the keys of the administrator that has them; it blocks, so call it in a thread."""
 
     def read() -> Sequence[KeyRecord]:
         records: Sequence[KeyRecord] = admin.keys.remote().result(timeout_s=BRIEFLY_S)
@@ -80,78 +80,82 @@ def keys_of(admin: "DeploymentHandle[Replica]") -> Callable[[], Sequence[KeyReco
 
 
 class AllSessions(SharedSessionStore):
-    """The sessions as one that administers sees them: it looks after none, and lists them all."""
+    """The sessions as an administrator sees them: it looks after none, and lists them all."""
 
     replicas: Sequence[DeploymentHandle[Any]] = ()
 
     def living_sessions(self) -> list[SessionRecord]:
-        """None, though copies of some be here."""
+        """None, though there may be local copies of some."""
         return []
 
     def newest_living(
-        self, domain: str | None, before: int | None, limit: int, at: float
+        self, domain: str | None, last_key: int | None, limit: int, time_s: float
     ) -> ListPage[ListedSession, int]:
-        """Those that live, each as the replica has it that looks after it."""
+        """As `SharedSessionStore.newest_living`, each session as the replica that looks after it has it."""
         marks = [mark for mark in self.marks() if domain in {None, mark.domain}]
-        newest = sorted((mark.number, mark.session_id) for mark in marks if before is None or mark.number < before)[
+        newest = sorted((mark.number, mark.session_id) for mark in marks if last_key is None or mark.number < last_key)[
             ::-1
         ]
         by_owner = defaultdict[int, list[str]](list)
         for _, session_id in newest[:limit]:
             by_owner[session_owners(session_id, len(self.replicas))[0]].append(session_id)
-        asked = [self.replicas[owner].listed.remote(session_ids) for owner, session_ids in by_owner.items()]
-        listed = _answers(asked, "a replica is away, so its sessions cannot be listed: try again")
+        responses = [
+            self.replicas[owner].listed_sessions.remote(session_ids) for owner, session_ids in by_owner.items()
+        ]
+        sessions = _answers(responses, "a replica is away, so its sessions cannot be listed: try again")
         living = {
             entry.session.number: entry
-            for entry in listed
-            if entry.session.ending is None and entry.session.expires_at > at
+            for entry in sessions
+            if entry.session.ending is None and entry.session.expires_at > time_s
         }
-        last = newest[limit - 1][0] if len(newest) > limit else None
-        return ListPage(tuple(living[number] for number in sorted(living, reverse=True)), last)
+        last_number = newest[limit - 1][0] if len(newest) > limit else None
+        return ListPage(tuple(living[number] for number in sorted(living, reverse=True)), last_number)
 
 
 class AllJobs:
-    """The jobs as one of several that administer sees them: its own, and those that the `others` are asked for."""
+    """The jobs as one of several administrators sees them: its own, and those of `other_administrators`."""
 
     def __init__(self) -> None:
-        self.others: Sequence[DeploymentHandle[Any]] = ()
+        self.other_administrators: Sequence[DeploymentHandle[Any]] = ()
 
-    def newest(self, catalog: Catalog, domain: str | None, before: int | None, limit: int) -> ListPage[JobRecord, int]:
-        """As `Catalog.newest_jobs`, of all of them; those of one domain are its administrator's, which is asked."""
+    def newest(
+        self, catalog: Catalog, domain: str | None, last_key: int | None, limit: int
+    ) -> ListPage[JobRecord, int]:
+        """As `Catalog.newest_jobs`, over all administrators; the jobs of one domain are in its administrator's."""
         if domain is not None:
-            return catalog.newest_jobs(domain, before, limit)
-        asked = [other.jobs.remote(before, limit + 1) for other in self.others]
-        numbered = catalog.numbered_jobs(None, before, limit + 1)
+            return catalog.newest_jobs(domain, last_key, limit)
+        responses = [administrator.jobs.remote(last_key, limit + 1) for administrator in self.other_administrators]
+        numbered = catalog.numbered_jobs(None, last_key, limit + 1)
         numbered += _answers(
-            asked,
+            responses,
             "one of those that administer is away, so its jobs cannot be listed: try again, or ask for those of one "
             "domain",
         )
         return ListPage.of(sorted(numbered, key=lambda entry: entry[0], reverse=True), limit)
 
 
-def _answers(asked: Sequence[DeploymentResponse[Any]], away: str) -> list[Any]:
-    """All that those who were asked have, whose lists follow one another; raises UnavailableError, saying `away`."""
+def _answers(responses: Sequence[DeploymentResponse[Any]], message: str) -> list[Any]:
+    """The entries of all lists that were asked for; raises UnavailableError with `message` where one does not come."""
     try:
-        return [entry for answer in asked for entry in answer.result(timeout_s=BRIEFLY_S)]
+        return [entry for response in responses for entry in response.result(timeout_s=BRIEFLY_S)]
     except (TimeoutError, RayError, RayServeException) as error:
-        for answer in asked:  # nobody waits for them any more
-            with suppress(RayError, RayServeException):  # which is what it would have answered
-                answer.cancel()
-        raise UnavailableError(away, retry_after_s=AWAY_S) from error
+        for response in responses:  # nobody waits for them any more
+            with suppress(RayError, RayServeException):  # its own failure
+                response.cancel()
+        raise UnavailableError(message, retry_after_s=AWAY_S) from error
 
 
 class Replica:
-    """The service as it is anywhere else, but that its sessions and keys are shared.
+    """The service as it is anywhere else, with shared sessions and keys.
 
     Args:
         settings: Of the whole fleet, which shares what is in its map store.
-        n_replicas: How many there are beside those that administer.
-        n_administrators: How many of these.
-        encoder: Has the networks; None: each has its own.
-        admin: The first that administers, which has the keys; None: this is it.
-        number: Of this one among those that administer, that have data directories and run jobs; None: it is none.
-        make_run_job: Makes what does jobs of a data directory, as `create_app` takes it; None: as there.
+        n_replicas: How many there are beside the administrators.
+        n_administrators: How many administrators there are.
+        encoder: Has the networks; None: each process has its own.
+        admin: The first administrator, which has the keys; None: this is it.
+        number: Of this one among the administrators, which have data directories and run jobs; None: it is none.
+        make_run_job: Makes the runner of a data directory's jobs that `create_app` takes; None: its own.
     """
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
@@ -165,20 +169,20 @@ class Replica:
         make_run_job: MakeRunJob | None = None,
     ) -> None:
         configure_logging(settings.log_level)
-        # Whoever takes a session over waits for many objects, which should keep nobody else waiting.
+        # Taking a session over waits for many objects, which should keep no other request waiting.
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         self._parts = AsyncExitStack()
         self._watching = list[asyncio.Task[None]]()
         objects = Objects.open(str(settings.map_store))
-        elsewhere, jobs = Substitutes(), AllJobs()
+        substitutes, jobs = Substitutes(), AllJobs()
         if admin is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(admin.lives.remote(0), _START_S)
-            elsewhere = replace(elsewhere, keys=keys_of(admin))
+            substitutes = replace(substitutes, keys=keys_of(admin))
         if number is not None:
             settings = settings.model_copy(update={"data_dir": administrator_folder(settings.data_dir, number)})
-            elsewhere = replace(
-                elsewhere,
+            substitutes = replace(
+                substitutes,
                 sessions=partial(AllSessions.open_shared, objects),
                 administrator=number,
                 newest_jobs=jobs.newest,
@@ -188,34 +192,36 @@ class Replica:
             self._parts.callback(shutil.rmtree, folder, ignore_errors=True)
             settings = settings.model_copy(update={"data_dir": folder})
             name = serve.get_replica_context().deployment
-            others = [Backend(serve.get_deployment_handle(replica_name(other))) for other in range(n_replicas)]
-            self._watching += [asyncio.create_task(backend.watch()) for backend in others]
+            replicas = [Backend(serve.get_deployment_handle(replica_name(other))) for other in range(n_replicas)]
+            self._watching += [asyncio.create_task(backend.watch()) for backend in replicas]
             sessions = partial(
                 SharedSessionStore.open_shared,
                 objects,
                 is_own=lambda session_id: replica_name(session_owners(session_id, n_replicas)[0]) == name,
             )
-            elsewhere = replace(elsewhere, sessions=sessions, owners=AskedOwners(others))
+            substitutes = replace(substitutes, sessions=sessions, owners=AskedOwners(replicas))
         if encoder is not None:
             backend = Backend(encoder)
             self._watching.append(asyncio.create_task(backend.watch()))
-            await backend.there(BRIEFLY_S)
-            asking = AskedEncoder(backend, asyncio.get_running_loop())
-            elsewhere = replace(elsewhere, make_evaluator=by_encoder(asking))
-        self._app = create_app(settings, make_run_job and make_run_job(settings.data_dir), elsewhere)
+            await backend.wait_for_process(BRIEFLY_S)
+            asked_encoder = AskedEncoder(backend, asyncio.get_running_loop())
+            substitutes = replace(substitutes, make_evaluator=by_encoder(asked_encoder))
+        self._app = create_app(settings, make_run_job and make_run_job(settings.data_dir), substitutes)
         await self._parts.enter_async_context(self._app.router.lifespan_context(self._app))
         self._services: Services = self._app.state.services
         if isinstance(store := self._services.session_store, AllSessions):
             store.replicas = [serve.get_deployment_handle(replica_name(replica)) for replica in range(n_replicas)]
-            beside = [each for each in range(n_administrators) if each != number]
-            jobs.others = [serve.get_deployment_handle(administrator_name(each)) for each in beside]
-            hear = (*store.replicas, *jobs.others, serve.get_deployment_handle("front"))
+            other_numbers = [other for other in range(n_administrators) if other != number]
+            jobs.other_administrators = [
+                serve.get_deployment_handle(administrator_name(other)) for other in other_numbers
+            ]
+            key_readers = (*store.replicas, *jobs.other_administrators, serve.get_deployment_handle("front"))
 
             async def announce() -> None:
-                asked = (each.reread_keys.remote() for each in hear)
-                told = asyncio.gather(*asked, return_exceptions=True)
-                with suppress(TimeoutError):  # who is away reads them at its start
-                    await asyncio.wait_for(told, BRIEFLY_S)
+                calls = (reader.reread_keys.remote() for reader in key_readers)
+                rereading = asyncio.gather(*calls, return_exceptions=True)
+                with suppress(TimeoutError):  # one that is away reads them at its start
+                    await asyncio.wait_for(rereading, BRIEFLY_S)
 
             if admin is None:
                 self._services.keys.announce = announce
@@ -224,50 +230,50 @@ class Replica:
         await self._parts.aclose()
 
     def check_health(self) -> None:
-        """Answered by the same event loop as everything else."""
+        """Answer from the event loop of all requests, so that one that hangs is seen."""
 
     async def keys(self) -> Sequence[KeyRecord]:
         """Every API key that was ever created."""
         return await asyncio.to_thread(self._services.catalog.keys)
 
     async def reread_keys(self) -> None:
-        """Let the keys count as they are by now."""
+        """Read the keys anew."""
         await self._services.keys.reread()
 
     async def administrator_of(self, domain: str) -> int | None:
-        """Which of those that administer has made a domain; None: there is none."""
+        """Number of the administrator that made a domain; None: there is no such domain."""
 
-        def told() -> int | None:
+        def administrator() -> int | None:
             try:
                 return cast("SharedCatalog", self._services.catalog).administrator_of(domain)
             except UnknownDomainError:
                 return None
 
-        return await asyncio.to_thread(told)
+        return await asyncio.to_thread(administrator)
 
     async def has_job(self, job_id: str) -> bool:
-        """Whether a job is one of this one's."""
+        """Whether a job is in this administrator's catalog."""
 
-        def told() -> bool:
+        def is_known() -> bool:
             try:
                 self._services.catalog.job(job_id)
             except UnknownJobError:
                 return False
             return True
 
-        return await asyncio.to_thread(told)
+        return await asyncio.to_thread(is_known)
 
-    async def jobs(self, before: int | None, limit: int) -> list[tuple[int, JobRecord]]:
+    async def jobs(self, last_key: int | None, limit: int) -> list[tuple[int, JobRecord]]:
         """As `Catalog.numbered_jobs`, of all domains."""
-        return await asyncio.to_thread(self._services.catalog.numbered_jobs, None, before, limit)
+        return await asyncio.to_thread(self._services.catalog.numbered_jobs, None, last_key, limit)
 
-    async def listed(self, session_ids: Sequence[str]) -> list[ListedSession]:
+    async def listed_sessions(self, session_ids: Sequence[str]) -> list[ListedSession]:
         """As `SharedSessionStore.listed_sessions`."""
         store = cast("SharedSessionStore", self._services.session_store)
         return await asyncio.to_thread(store.listed_sessions, session_ids)
 
     async def answer(self, method: str, *arguments: Any) -> Any:
-        """What `gathered` or `part` answers, or the error of ours that it raises."""
+        """The answer of `gathered` or `part`, or the error of ours that it raises."""
         try:
             return await getattr(self, method)(*arguments)
         except DeepSimbadError as error:
@@ -276,52 +282,56 @@ class Replica:
     async def gathered(
         self, names: Sequence[str], is_all: bool
     ) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
-        """As `Atlas.gather`, of each map its head."""
+        """As `Atlas.gather`, with each map's head in place of the map."""
 
         def heads() -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
-            there, left_out = self._services.atlas.gather(names, is_all)
-            return [replace(mapped, snapshot=cast("Map", MapHead.of(mapped.snapshot))) for mapped in there], left_out
+            mapped_domains, left_out = self._services.atlas.gather(names, is_all)
+            return [
+                replace(domain, snapshot=cast("Map", MapHead.of(domain.snapshot))) for domain in mapped_domains
+            ], left_out
 
         return await asyncio.to_thread(heads)
 
     async def part(self, domains: Sequence[MappedDomain], view: View, n_in_full: int, n_shortlist: int | None) -> Part:
-        """What a view is to domains of one evaluator whose heads were gathered; where on them as it is answered."""
-        services, versions = self._services, {mapped.record.name: mapped.snapshot.version for mapped in domains}
-        there, left_out = await asyncio.to_thread(services.atlas.gather, list(versions), True)
-        same = [mapped for mapped in there if mapped.snapshot.version == versions[mapped.record.name]]
-        for name in versions.keys() - {mapped.record.name for mapped in same} - left_out.keys():
+        """As `Atlas.ask`, by the maps whose heads were gathered, with localizations rendered as answers hold them."""
+        services, versions = self._services, {domain.record.name: domain.snapshot.version for domain in domains}
+        mapped_domains, left_out = await asyncio.to_thread(services.atlas.gather, list(versions), True)
+        unchanged = [domain for domain in mapped_domains if domain.snapshot.version == versions[domain.record.name]]
+        for name in versions.keys() - {domain.record.name for domain in unchanged} - left_out.keys():
             left_out[name] = NotLoadedError("its map was switched this moment: ask again")
         evaluator = services.evaluators.evaluator(domains[0].record.evaluator)
-        part = await services.worker.computed(lambda: services.atlas.ask(same, evaluator, view, n_in_full, n_shortlist))
+        part = await services.worker.computed(
+            lambda: services.atlas.ask(unchanged, evaluator, view, n_in_full, n_shortlist)
+        )
         likeliest = {
-            name: cast("Mapping[str, Any]", render_localization(cast("Localization", each), Stopwatch()))
-            for name, each in part.likeliest.items()
+            name: cast("Mapping[str, Any]", render_localization(cast("Localization", localization), Stopwatch()))
+            for name, localization in part.likeliest.items()
         }
         return Part(part.log_evidences, likeliest, {**left_out, **part.left_out})
 
     async def follow(self) -> None:
-        """Take over now what the others have published."""
+        """Take over now what other processes have published."""
         await follow(self._services)
 
     async def lives(self, seconds: float) -> None:
-        """Answer after a while, so that whoever waits for it learns at once of this process's end."""
-        if seconds == 0:  # nobody told it what was published while it started
+        """Answer after some seconds, so that who waits for it learns at once of this process's end."""
+        if seconds == 0:  # it may have missed what was published while it started
             with suppress(DeepSimbadError):
                 await self.follow()
         await asyncio.sleep(seconds)
 
     async def ask(self, scope: Scope, body: bytes) -> list[Message]:
-        """A short answer whole."""
+        """A short answer of the application, all its messages at once."""
         return [message async for message in self.stream(scope, body)]
 
     async def stream(self, scope: Scope, body: bytes) -> AsyncGenerator[Message]:
-        """An answer as the application sends it, which is asked without a socket."""
+        """An answer of the application, message by message; it is called without a socket."""
         parts = [{"type": "http.request", "body": body, "more_body": False}]
         send, messages = anyio.create_memory_object_stream[Message](_MESSAGES)
 
         async def receive() -> Message:
             if not parts:
-                await asyncio.Event().wait()  # nobody leaves; who does is heard of by cancelling
+                await asyncio.Event().wait()  # a client that leaves is told by cancelling, not by a message
             return parts.pop()
 
         async def answer() -> None:
@@ -338,7 +348,7 @@ class Replica:
 
 
 def _new_folder() -> Path:
-    """An empty folder of this process's, once those of processes that were killed were removed."""
+    """An empty folder for this process; those of processes that were killed are removed."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
         with suppress(OSError):  # another user's
             process = Path("/proc", folder.name.removeprefix(_FOLDER_PREFIX).partition("-")[0], "exe")
