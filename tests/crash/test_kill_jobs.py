@@ -1,4 +1,4 @@
-"""A remap survives the death of the service and its orderly stop; the death of its own process it does not."""
+"""A remap survives the service's death and its orderly stop, but not the death of its own process."""
 
 import json
 import os
@@ -44,12 +44,12 @@ def server(tmp_path: Path) -> Iterator[LocalServer]:
         yield running
 
 
-def until(look: Callable[[], Any]) -> Any:
+def wait_until(look: Callable[[], Any]) -> Any:
     give_up = time.monotonic() + WITHIN_S
-    while not (found := look()):
+    while not (result := look()):
         assert time.monotonic() < give_up
         time.sleep(0.02)
-    return found
+    return result
 
 
 def log_of(server: LocalServer) -> list[dict[str, Any]]:
@@ -57,12 +57,12 @@ def log_of(server: LocalServer) -> list[dict[str, Any]]:
 
 
 def training(server: LocalServer, client: Client) -> tuple[Job, int]:
-    """A job that is at training its experience database, and the process it is in."""
+    """A job that is training its experience database, and the id of its process."""
     job = client.admin.remap("campus", **CONFIG, training_episodes=LONG)
-    until(lambda: client.admin.job(job.job_id).stage == "train")
+    wait_until(lambda: client.admin.job(job.job_id).stage == "train")
     started = [line for line in log_of(server) if line["message"] == "a job's process started"]
-    (begun,) = [line for line in started if line["job_id"] == job.job_id]
-    return job, begun["pid"]
+    (start_line,) = [line for line in started if line["job_id"] == job.job_id]
+    return job, start_line["pid"]
 
 
 def is_gone(pid: int) -> bool:
@@ -72,48 +72,48 @@ def is_gone(pid: int) -> bool:
         return True
 
 
-def ended(client: Client, job_id: str) -> Job:
-    until(lambda: client.admin.job(job_id).ended)
+def ended_job(client: Client, job_id: str) -> Job:
+    wait_until(lambda: client.admin.job(job_id).ended)
     return client.admin.job(job_id)
 
 
-@pytest.mark.parametrize("how", ["kill", "stop"])
-def test_the_next_service_begins_it_again_and_makes_one_map(server: LocalServer, how: str) -> None:
+@pytest.mark.parametrize("end", ["kill", "stop"])
+def test_the_next_service_begins_it_again_and_makes_one_map(server: LocalServer, end: str) -> None:
     with Client(server.url) as client:
         job, pid = training(server, client)
         waits = client.admin.remap("campus", **CONFIG, training_episodes=SHORT)
         with pytest.raises(TraverseInUseError):
             client.admin.delete_domain("campus")
-        getattr(server, how)()
-        until(lambda: is_gone(pid))
+        getattr(server, end)()
+        wait_until(lambda: is_gone(pid))
         with Catalog.open(server.log_path.parent / "data") as catalog:
-            left = catalog.job(job.job_id)
-        assert (left.state, left.n_starts) == (("running", 1) if how == "kill" else ("queued", 0))
+            record = catalog.job(job.job_id)
+        assert (record.state, record.n_starts) == (("running", 1) if end == "kill" else ("queued", 0))
         server.start()
         with pytest.raises(TraverseInUseError):
             client.admin.delete_traverse("campus", "drive")
-        done, after = ended(client, job.job_id), ended(client, waits.job_id)
-        assert (done.state, after.state) == ("succeeded", "succeeded"), (done, after)
-        assert [each.version for each in client.admin.maps("campus")] == [2, 1]
-        assert done.result is not None
-        assert done.result["map_version"] == 1
+        first_job, second_job = ended_job(client, job.job_id), ended_job(client, waits.job_id)
+        assert (first_job.state, second_job.state) == ("succeeded", "succeeded"), (first_job, second_job)
+        assert [version.version for version in client.admin.maps("campus")] == [2, 1]
+        assert first_job.result is not None
+        assert first_job.result["map_version"] == 1
 
 
 def test_a_job_whose_own_process_dies_fails_by_name_and_one_that_is_cancelled_ends(server: LocalServer) -> None:
     with Client(server.url) as client:
         job, pid = training(server, client)
         os.kill(pid, signal.SIGKILL)
-        failed = ended(client, job.job_id)
+        failed = ended_job(client, job.job_id)
         assert failed.state == "failed"
         assert failed.error is not None
         assert failed.error["code"] == "job_interrupted"
         assert "SIGKILL" in str(failed.error)
         assert client.admin.maps("campus") == ()
         next_job = client.admin.remap("campus", **CONFIG, training_episodes=SHORT)
-        assert ended(client, next_job.job_id).state == "succeeded"
+        assert ended_job(client, next_job.job_id).state == "succeeded"
 
         job, pid = training(server, client)  # and one is cancelled in its process
         client.admin.cancel_job(job.job_id)
-        assert ended(client, job.job_id).state == "cancelled"
-        until(lambda: is_gone(pid))
+        assert ended_job(client, job.job_id).state == "cancelled"
+        wait_until(lambda: is_gone(pid))
         client.admin.delete_domain("campus")

@@ -1,4 +1,4 @@
-"""kill -9 under load, as `make soak` does it for longer: nothing that was acknowledged is lost, no file is damaged."""
+"""After kill -9 under load, as in `make soak` but shorter, nothing acknowledged is lost and no file is damaged."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def test_a_few_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trial, "LONGEST_LIFE_S", 1.0)
     result = soak(tmp_path / "data", n_kills=3, seed=2)
     assert len(result.ready_s) == len(result.empty_ready_s) == 3, "it was ready again every time"
-    assert all(result.n_acknowledged[who] for who in ("Robot", "Uploader", "Mapper"))
+    assert all(result.n_acknowledged[actor] for actor in ("Robot", "Uploader", "Mapper"))
     assert result.n_remaps + result.n_interrupted >= 1
 
 

@@ -1,4 +1,4 @@
-"""Asked to stop: what was acknowledged is there afterwards, what was begun is finished, and then it ends."""
+"""A service that is asked to stop finishes what it has begun, keeps what it acknowledged, and ends."""
 
 import http.client
 import json
@@ -40,9 +40,9 @@ class Service(LocalServer):
 
     def request(self, method: str, path: str, body: Any = None) -> tuple[int, bytes]:
         with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)) as connection:
-            sent = body if isinstance(body, bytes) or body is None else json.dumps(body)
+            content = body if isinstance(body, bytes) or body is None else json.dumps(body)
             kind = "application/octet-stream" if isinstance(body, bytes) else "application/json"
-            connection.request(method, path, sent, {"Content-Type": kind})
+            connection.request(method, path, content, {"Content-Type": kind})
             answer = connection.getresponse()
             return answer.status, answer.read()
 
@@ -52,16 +52,16 @@ class Service(LocalServer):
         return json.loads(content) if content else None
 
 
-def until(met: Callable[[], Any]) -> None:
+def wait_until(condition: Callable[[], Any]) -> None:
     for _ in range(6000):
-        if met():
+        if condition():
             return
         time.sleep(0.01)
     raise AssertionError("it did not come about")
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mapped_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data directory with a map; never touched."""
     service = Service(tmp_path_factory.mktemp("mapped") / "data")
     service.start()
@@ -74,9 +74,9 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def service(mapped: Path, tmp_path: Path) -> Iterator[Service]:
-    """A service on a copy of it, to be started."""
-    service = Service(shutil.copytree(mapped, tmp_path / "data"))
+def service(mapped_dir: Path, tmp_path: Path) -> Iterator[Service]:
+    """A service, not started yet, on a copy of the mapped data directory."""
+    service = Service(shutil.copytree(mapped_dir, tmp_path / "data"))
     try:
         yield service
         assert "Traceback" not in service.log_path.read_text()
@@ -127,8 +127,8 @@ class Robot:
                 if answer.status != 200:
                     self.refusals.append(answer.status)
                     return
-                told = json.loads(content)
-                self.n_told, self.belief = told["n_observations"], told["belief"]
+                document = json.loads(content)
+                self.n_told, self.belief = document["n_observations"], document["belief"]
         except (OSError, http.client.HTTPException):
             return
         finally:
@@ -147,10 +147,10 @@ def test_what_was_acknowledged_is_there_afterwards(service: Service) -> None:
         robot.begin()
     for by, code in ENDS.items():
         threads = [threading.Thread(target=robot.until_refused) for robot in robots]
-        before = sum(robot.n_told for robot in robots)
+        n_before = sum(robot.n_told for robot in robots)
         for thread in threads:
             thread.start()
-        until(lambda least=before + 100: sum(robot.n_told for robot in robots) >= least)
+        wait_until(lambda n_least=n_before + 100: sum(robot.n_told for robot in robots) >= n_least)
         service.signal(by)
         assert service.wait(60) == code
         for thread in threads:
@@ -173,8 +173,8 @@ def send_frame(service: Service, n_sent: int) -> socket.socket:
 
 def read_all(connection: socket.socket) -> bytes:
     received = b""
-    while more := connection.recv(65536):
-        received += more
+    while piece := connection.recv(65536):
+        received += piece
     return received
 
 
@@ -196,7 +196,7 @@ def test_what_is_under_way_is_finished_and_what_is_idle_is_closed(service: Servi
         service.signal(signal.SIGTERM)
         assert idle.recv(65536) == b""
         assert fresh.recv(65536) == b""
-        until(lambda: is_stopping(service))
+        wait_until(lambda: is_stopping(service))
         under_way.sendall(json.dumps({"encoding": [1.0] * 8}).encode()[5:])
         answer = read_all(under_way)
         assert answer.startswith(b"HTTP/1.1 200 ")
@@ -221,9 +221,9 @@ def test_event_streams_end(service: Service) -> None:
     job = service.ask("POST", "/v1/admin/domains/loop/remaps", config | {"training_episodes": 1_000_000})
     with service.connect() as stream:
         stream.sendall(f"GET /v1/admin/jobs/{job['job_id']}/events HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-        begun = b""
-        while b"event: progress" not in begun:
-            begun += stream.recv(65536)
+        received = b""
+        while b"event: progress" not in received:
+            received += stream.recv(65536)
         service.signal(signal.SIGTERM)
         assert read_all(stream).endswith(b"0\r\n\r\n")
     assert service.wait(60) == 0
@@ -241,7 +241,7 @@ def test_a_second_signal_does_not_wait(service: Service) -> None:
         with send_frame(service, 5):
             time.sleep(0.1)
             service.signal(by)
-            until(lambda: is_stopping(service))
+            wait_until(lambda: is_stopping(service))
             service.signal(by)
             assert service.wait(60) == code
         service.start()

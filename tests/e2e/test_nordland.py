@@ -1,4 +1,4 @@
-"""Real images of two seasons through real HTTP come to the figures that are promised."""
+"""Real images of two seasons, sent over real HTTP, reach the promised figures."""
 
 import pytest
 

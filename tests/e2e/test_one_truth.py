@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def campus(rendered):
-    """SOURCE by season."""
+    """The recordings' SOURCEs by season."""
     return {season: f"nclt:{rendered}/{PAPER_DATES[season]}" for season in ("winter", "spring")}
 
 
@@ -41,7 +41,7 @@ def service(campus, tmp_path_factory):
 
 @pytest.mark.parametrize("relevance", ["composed", "standardised", "rrf"])
 def test_a_replay_has_the_anr_of_the_experiment(service, tmp_path, relevance):
-    """The same drive and map, once over HTTP and once offline: the same number."""
+    """The same drive and map give the same number over HTTP and offline."""
     client, _ = service
     rng = np.random.default_rng(7)
     places = rng.normal(size=(150, 32)) + np.cumsum(rng.normal(size=(150, 32)), axis=0) / 4
@@ -75,12 +75,12 @@ def test_a_map_made_here_equals_one_made_over_http(campus, service, tmp_path):
     for folder in (data_dir, tmp_path):
         with Catalog.open(folder) as catalog:
             maps.append(read_map(catalog.map_path("campus", 1)))
-    over_http, here = maps
-    assert np.array_equal(over_http.lists, here.lists)
-    assert np.array_equal(over_http.landmark_model["prototypes"], here.landmark_model["prototypes"])
-    assert np.array_equal(over_http.statistics, here.statistics)
-    assert np.array_equal(over_http.usual_encoding, here.usual_encoding)
-    assert np.array_equal(over_http.view_bits, here.view_bits)
-    assert np.array_equal(over_http.position_m, here.position_m)
-    assert np.array_equal(over_http.x_m, here.x_m)
-    assert np.array_equal(over_http.timestamp_us, here.timestamp_us)
+    over_http, local = maps
+    assert np.array_equal(over_http.lists, local.lists)
+    assert np.array_equal(over_http.landmark_model["prototypes"], local.landmark_model["prototypes"])
+    assert np.array_equal(over_http.statistics, local.statistics)
+    assert np.array_equal(over_http.usual_encoding, local.usual_encoding)
+    assert np.array_equal(over_http.view_bits, local.view_bits)
+    assert np.array_equal(over_http.position_m, local.position_m)
+    assert np.array_equal(over_http.x_m, local.x_m)
+    assert np.array_equal(over_http.timestamp_us, local.timestamp_us)

@@ -30,14 +30,14 @@ def command(*arguments: object) -> Ran:
     """Run `deepsimbad`; a service in a process of its own."""
     if arguments[0] != "serve":
         return ran(["deepsimbad", *arguments])
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "deepsimbad", *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,
         timeout=120,
     )
-    return Ran(done.returncode, done.stdout, done.stderr)
+    return Ran(process.returncode, process.stdout, process.stderr)
 
 
 SERVE = [sys.executable, "-m", "deepsimbad", "serve", "--create"]
@@ -50,7 +50,7 @@ class Service:
 
     Args:
         data_dir: Its data directory.
-        ready: Whether to wait until it is ready; else until it answers at all.
+        ready: Whether to wait until it is ready, or only until it answers at all.
     """
 
     def __init__(self, data_dir: Path, ready: bool = True) -> None:
@@ -58,7 +58,7 @@ class Service:
             probe.bind(("127.0.0.1", 0))
             self._port = int(probe.getsockname()[1])
         self._data_dir = data_dir
-        self._asked_first = "/readyz" if ready else "/healthz"
+        self._ready_path = "/readyz" if ready else "/healthz"
         self._client = httpx2.Client(base_url=f"http://127.0.0.1:{self._port}", timeout=60, trust_env=False)
         self.log: list[str] = []
 
@@ -80,57 +80,57 @@ class Service:
 
     def __exit__(self, *exception: object) -> None:
         self._process.terminate()
-        self._ended()
+        self._wait_for_end()
 
     def kill(self) -> None:
         """End it as a power cut would."""
         self._process.kill()
-        self._ended()
+        self._wait_for_end()
 
     @property
     def pid(self) -> int:
         return self._process.pid
 
-    def ask(self, method: str, path: str, **more: Any) -> httpx2.Response:
-        return self._client.request(method, path, **more)
+    def ask(self, method: str, path: str, **options: Any) -> httpx2.Response:
+        return self._client.request(method, path, **options)
 
-    def told(self, method: str, path: str, **more: Any) -> Any:
+    def answer_to(self, method: str, path: str, **options: Any) -> Any:
         """The answer to a request that succeeds."""
-        answer = self.ask(method, path, **more)
+        answer = self.ask(method, path, **options)
         assert answer.status_code < 300, answer.text
         return answer.json() if answer.content else None
 
-    def refused(self, method: str, path: str, **more: Any) -> dict[str, Any]:
-        """The problem that a request meets: named, and of no other kind than documented."""
-        answer = self.ask(method, path, **more)
+    def problem_of(self, method: str, path: str, **options: Any) -> dict[str, Any]:
+        """The problem document of a request that fails, of any code but `internal_error`."""
+        answer = self.ask(method, path, **options)
         assert answer.status_code >= 400, answer.text
         assert answer.headers["content-type"] == "application/problem+json"
         problem: dict[str, Any] = answer.json()
         assert problem["code"] != "internal_error", "".join(self.log[-5:])
         return problem
 
-    def observe(self, session_id: str, view: int, **more: Any) -> dict[str, Any]:
-        """What a robot sends, the same again for the same view."""
+    def observe(self, session_id: str, view: int, **options: Any) -> dict[str, Any]:
+        """The request of an observation, the same for the same view."""
         ranks = np.random.default_rng(view).permutation(N_LANDMARKS).tolist()
         return {
             "path": f"/v1/sessions/{session_id}/observations?action_m=1",
             "json": {"ranked_landmarks": ranks},
             "headers": {"Idempotency-Key": f"view-{view}"},
-            **more,
+            **options,
         }
 
     def ended_job(self, job_id: str) -> dict[str, Any]:
         """A job, once it has ended."""
         give_up = time.monotonic() + READY_WITHIN_S
         while time.monotonic() < give_up:
-            job: dict[str, Any] = self.told("GET", f"/v1/admin/jobs/{job_id}")
+            job: dict[str, Any] = self.answer_to("GET", f"/v1/admin/jobs/{job_id}")
             if job["state"] in {"succeeded", "failed", "cancelled"}:
                 return job
             time.sleep(0.05)
         raise AssertionError("the job did not end")
 
     def logged(self, message: str) -> None:
-        """Wait until the service has logged something."""
+        """Wait until the service has logged this message."""
         give_up = time.monotonic() + READY_WITHIN_S
         while not any(f'"message": "{message}"' in line for line in list(self.log)):
             assert time.monotonic() < give_up, self.log[-5:]
@@ -138,7 +138,7 @@ class Service:
 
     def _is_ready(self) -> bool:
         try:
-            return self.ask("GET", self._asked_first).status_code == 200
+            return self.ask("GET", self._ready_path).status_code == 200
         except httpx2.TransportError:
             return False
 
@@ -147,7 +147,7 @@ class Service:
         for line in self._process.stderr:
             self.log.append(line)
 
-    def _ended(self) -> None:
+    def _wait_for_end(self) -> None:
         try:
             self._process.wait(60)
         except subprocess.TimeoutExpired:
@@ -160,7 +160,7 @@ class Service:
 
 
 def batch(first: int, n: int = N_PLACES) -> bytes:
-    """Frames of a drive as an upload."""
+    """A batch of `n` frames of a drive, from index `first` on, as an upload's body."""
     packed = io.BytesIO()
     index = np.arange(first, first + n)
     encodings = np.random.default_rng(7).normal(size=(first + n, DIM))[first:]
@@ -191,39 +191,39 @@ def furnish(data_dir: Path) -> None:
     with Service(data_dir) as service:
         for domain, n_maps in (("loop", 2), ("yard", 1)):
             body = {"evaluator": {"kind": "feature_l2", "extractor": "none"}, "closed": domain == "loop"}
-            service.told("PUT", f"/v1/admin/domains/{domain}", json=body)
-            service.told("POST", f"/v1/admin/domains/{domain}/traverses", json={"name": "drive"})
+            service.answer_to("PUT", f"/v1/admin/domains/{domain}", json=body)
+            service.answer_to("POST", f"/v1/admin/domains/{domain}/traverses", json={"name": "drive"})
             path = f"/v1/admin/domains/{domain}/traverses/drive/frames"
-            service.told("POST", path, content=batch(0), headers=NPZ)
+            service.answer_to("POST", path, content=batch(0), headers=NPZ)
             for _ in range(n_maps):
-                job = service.told("POST", f"/v1/admin/domains/{domain}/remaps", json=REMAP)
+                job = service.answer_to("POST", f"/v1/admin/domains/{domain}/remaps", json=REMAP)
                 assert service.ended_job(job["job_id"])["state"] == "succeeded"
 
 
 @pytest.fixture
 def data_dir(furnished: Path, tmp_path: Path) -> Path:
-    """A copy of it to damage."""
+    """A copy of the furnished data directory, to damage."""
     return Path(shutil.copytree(furnished, tmp_path / "data"))
 
 
 def begin(service: Service, n_views: int = 3) -> str:
     """A session with some views, each acknowledged."""
-    session_id: str = service.told("POST", "/v1/domains/loop/sessions", json={"belief": "grid"})["session_id"]
+    session_id: str = service.answer_to("POST", "/v1/domains/loop/sessions", json={"belief": "grid"})["session_id"]
     for view in range(n_views):
-        answer = service.told("POST", **service.observe(session_id, view))
+        answer = service.answer_to("POST", **service.observe(session_id, view))
         assert answer["n_observations"] == view + 1
     return session_id
 
 
 def check_is_clean(data_dir: Path) -> None:
-    """Nothing is damaged."""
+    """Check that `deepsimbad check` finds nothing damaged."""
     ran = command("check", "--data-dir", data_dir)
     assert (ran.code, ran.out) == (0, ""), ran
 
 
 @contextmanager
 def small_disk(n_bytes: int) -> Iterator[Path]:
-    """A file system of its own, of so many bytes; skips where none may be mounted."""
+    """A folder on a file system of its own of `n_bytes`; skips the test where none may be mounted."""
     folder = Path(tempfile.mkdtemp())
     mount = ["mount", "-t", "tmpfs", "-o", f"size={n_bytes}", "tmpfs", str(folder)]
     if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:

@@ -1,4 +1,4 @@
-"""A backup taken while robots observe, drives are uploaded and maps are made and switched: all told before is in it."""
+"""A backup beside a busy service holds all that was acknowledged before it began."""
 
 import threading
 from collections.abc import Callable
@@ -14,7 +14,7 @@ DRIVE = "/v1/admin/domains/yard/traverses/drive"
 
 
 @dataclass
-class Told:
+class Progress:
     """What the service has acknowledged so far."""
 
     views: dict[str, int] = field(default_factory=dict)
@@ -22,78 +22,78 @@ class Told:
     version: int = 1
 
 
-def robot(service: Service, told: Told, ended: threading.Event) -> None:
+def robot(service: Service, progress: Progress, stop: threading.Event) -> None:
     session_id = begin(service, 1)
-    told.views[session_id] = 1
-    while not ended.is_set():
-        view = told.views[session_id]
-        told.views[session_id] = service.told("POST", **service.observe(session_id, view))["n_observations"]
-        ended.wait(0.02)  # or no job gets anywhere
+    progress.views[session_id] = 1
+    while not stop.is_set():
+        view = progress.views[session_id]
+        progress.views[session_id] = service.answer_to("POST", **service.observe(session_id, view))["n_observations"]
+        stop.wait(0.02)  # or no job gets anywhere
 
 
-def uploader(service: Service, told: Told, ended: threading.Event) -> None:
-    while not ended.is_set():
-        told.n_frames = service.told("POST", f"{DRIVE}/frames", content=batch(told.n_frames, 5), headers=NPZ)[
-            "n_frames"
-        ]
-        ended.wait(0.02)
+def uploader(service: Service, progress: Progress, stop: threading.Event) -> None:
+    while not stop.is_set():
+        progress.n_frames = service.answer_to(
+            "POST", f"{DRIVE}/frames", content=batch(progress.n_frames, 5), headers=NPZ
+        )["n_frames"]
+        stop.wait(0.02)
 
 
-def mapper(service: Service, told: Told, ended: threading.Event) -> None:
-    while not ended.is_set():
-        job = service.ended_job(service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)["job_id"])
+def mapper(service: Service, progress: Progress, stop: threading.Event) -> None:
+    while not stop.is_set():
+        job = service.ended_job(service.answer_to("POST", "/v1/admin/domains/yard/remaps", json=REMAP)["job_id"])
         assert job["state"] == "succeeded", job
-        told.version = job["result"]["map_version"]
-        service.told("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1 + told.version % 2})
+        progress.version = job["result"]["map_version"]
+        service.answer_to("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1 + progress.version % 2})
 
 
 def test_everything_acknowledged_before_it_began_comes_back(data_dir: Path, tmp_path: Path) -> None:
-    told, ended = Told(), threading.Event()
-    failed: list[BaseException] = []
+    progress, stop = Progress(), threading.Event()
+    errors: list[BaseException] = []
 
-    def guarded(work: Callable[[Service, Told, threading.Event], None], service: Service) -> None:
+    def guarded(work: Callable[[Service, Progress, threading.Event], None], service: Service) -> None:
         try:
-            work(service, told, ended)
+            work(service, progress, stop)
         except BaseException as error:
-            failed.append(error)
+            errors.append(error)
 
     with Service(data_dir) as service:
         threads = [threading.Thread(target=guarded, args=(work, service)) for work in (robot, robot, uploader, mapper)]
         for thread in threads:
             thread.start()
         try:
-            while told.version < 2:
-                assert not failed, failed
-                ended.wait(0.05)
-            before = Told(dict(told.views), told.n_frames, told.version)
+            while progress.version < 2:
+                assert not errors, errors
+                stop.wait(0.05)
+            progress_before = Progress(dict(progress.views), progress.n_frames, progress.version)
             ran = command("backup", tmp_path / "backup.tar", "--data-dir", data_dir)
             assert ran.code == 0, ran
             check_is_clean(data_dir)
         finally:
-            ended.set()
+            stop.set()
             for thread in threads:
                 thread.join()
-        assert not failed, failed
-    there = tmp_path / "there"
-    assert command("restore", tmp_path / "backup.tar", "--data-dir", there).code == 0
-    check_is_clean(there)  # the map that was being made
-    with Service(there) as service:
-        for session_id, n_views in before.views.items():
-            assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] >= n_views
-        assert service.told("GET", DRIVE)["n_frames"] >= before.n_frames
-        assert service.told("GET", "/v1/domains/yard")["map_version"] >= before.version
-    check_is_clean(there)
+        assert not errors, errors
+    restored_dir = tmp_path / "there"
+    assert command("restore", tmp_path / "backup.tar", "--data-dir", restored_dir).code == 0
+    check_is_clean(restored_dir)  # the map that was being made
+    with Service(restored_dir) as service:
+        for session_id, n_views in progress_before.views.items():
+            assert service.answer_to("GET", f"/v1/sessions/{session_id}")["n_observations"] >= n_views
+        assert service.answer_to("GET", DRIVE)["n_frames"] >= progress_before.n_frames
+        assert service.answer_to("GET", "/v1/domains/yard")["map_version"] >= progress_before.version
+    check_is_clean(restored_dir)
 
 
 def test_a_mounted_folder_is_restored_into(furnished: Path, tmp_path: Path) -> None:
-    """As the volume of a container: it cannot be replaced by a rename."""
+    """Such a folder, as a container's volume, cannot be replaced by a rename."""
     assert command("backup", tmp_path / "b.tar", "--data-dir", furnished).code == 0
     with small_disk(48 * 2**20) as volume:
         ran = command("restore", tmp_path / "b.tar", "--data-dir", volume)
         assert ran.code == 0, ran
-        there = {path.name for path in volume.iterdir()} - {"service.lock"}
-        assert there == {"catalog.sqlite", "domains", "sessions.sqlite"}
+        names = {path.name for path in volume.iterdir()} - {"service.lock"}
+        assert names == {"catalog.sqlite", "domains", "sessions.sqlite"}
         check_is_clean(volume)
         assert "is not empty" in command("restore", tmp_path / "b.tar", "--data-dir", volume).line
         with Service(volume) as service:
-            assert service.told("GET", "/v1/domains/loop")["map_version"] == 2
+            assert service.answer_to("GET", "/v1/domains/loop")["map_version"] == 2

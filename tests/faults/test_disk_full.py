@@ -1,4 +1,4 @@
-"""A disk that takes no more: named, nothing acknowledged is lost, and it goes on when there is room again.
+"""A full disk is named, nothing acknowledged is lost, and the service goes on when there is room again.
 
 Two ways to fill it: a small file system, where one can be mounted, and the kernel's limit on the size of files, which
 can be put on the running service anywhere.
@@ -48,11 +48,11 @@ def no_room_left(folder: Path, _service: Service) -> Iterator[None]:
 @contextmanager
 def no_file_grows(_folder: Path, service: Service) -> Iterator[None]:
     """Let the service write to no file."""
-    before = resource.prlimit(service.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+    limits = resource.prlimit(service.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
     try:
         yield
     finally:
-        resource.prlimit(service.pid, resource.RLIMIT_FSIZE, before)
+        resource.prlimit(service.pid, resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.fixture(params=["file system", "limit"])
@@ -65,46 +65,46 @@ def disk(request: pytest.FixtureRequest, furnished: Path, tmp_path: Path) -> Ite
 
 
 def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, Fill]) -> None:
-    data_dir, full = disk
+    data_dir, fill = disk
     with Service(data_dir) as service:
         session_id = begin(service, 3)
         frames = "/v1/admin/domains/yard/traverses/drive/frames"
-        told = service.told("POST", frames, content=batch(60, 20), headers=NPZ)
-        assert told["n_frames"] == 80
-        with full(data_dir.parent, service):
+        traverse = service.answer_to("POST", frames, content=batch(60, 20), headers=NPZ)
+        assert traverse["n_frames"] == 80
+        with fill(data_dir.parent, service):
             problems = [
-                service.refused("POST", **service.observe(session_id, 3)),
-                service.refused("POST", frames, content=batch(80, 20), headers=NPZ),
-                service.refused("PUT", "/v1/admin/domains/new", json={"evaluator": {"kind": "feature_l2"}}),
-                service.refused("POST", "/v1/admin/domains/yard/traverses", json={"name": "more"}),
+                service.problem_of("POST", **service.observe(session_id, 3)),
+                service.problem_of("POST", frames, content=batch(80, 20), headers=NPZ),
+                service.problem_of("PUT", "/v1/admin/domains/new", json={"evaluator": {"kind": "feature_l2"}}),
+                service.problem_of("POST", "/v1/admin/domains/yard/traverses", json={"name": "more"}),
             ]
             # A refused write lets its log begin anew, so that a small one may find room in it after all.
-            begun = service.ask("POST", "/v1/domains/loop/sessions", json={})
-            switched = service.ask("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1})
-            problems += [answer.json() for answer in (begun, switched) if answer.status_code >= 400]
+            session_answer = service.ask("POST", "/v1/domains/loop/sessions", json={})
+            switch_answer = service.ask("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1})
+            problems += [answer.json() for answer in (session_answer, switch_answer) if answer.status_code >= 400]
             for problem in problems:
                 assert (problem["status"], problem["code"]) == (503, "unavailable"), problem
                 assert problem["reason"] in FULL, problem
             # Whoever only asks is answered all the same.
-            assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
-            view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
-            version = 2 if switched.status_code >= 400 else 1
+            assert service.answer_to("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
+            view = service.answer_to("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+            version = 2 if switch_answer.status_code >= 400 else 1
             assert view["map_version"] == version
-            assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 80
-        again = service.told("POST", **service.observe(session_id, 3))
-        assert again["n_observations"] == 4
-        assert service.told("POST", frames, content=batch(80, 20), headers=NPZ)["n_frames"] == 100
-        job = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
+            assert service.answer_to("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 80
+        session = service.answer_to("POST", **service.observe(session_id, 3))
+        assert session["n_observations"] == 4
+        assert service.answer_to("POST", frames, content=batch(80, 20), headers=NPZ)["n_frames"] == 100
+        job = service.answer_to("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
         assert service.ended_job(job["job_id"])["state"] == "succeeded"
-        assert service.told("GET", "/v1/domains/loop")["map_version"] == version
+        assert service.answer_to("GET", "/v1/domains/loop")["map_version"] == version
         service.kill()
         check_is_clean(data_dir)
     with Service(data_dir) as service:
-        assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
-        if begun.status_code < 400:
-            assert service.told("GET", f"/v1/sessions/{begun.json()['session_id']}")["map_version"] == 2
-        assert service.told("GET", "/v1/domains/loop")["map_version"] == version
-        assert service.told("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 100
+        assert service.answer_to("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
+        if session_answer.status_code < 400:
+            assert service.answer_to("GET", f"/v1/sessions/{session_answer.json()['session_id']}")["map_version"] == 2
+        assert service.answer_to("GET", "/v1/domains/loop")["map_version"] == version
+        assert service.answer_to("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] == 100
     check_is_clean(data_dir)
 
 
@@ -115,55 +115,57 @@ def test_a_service_that_is_restarted_on_a_full_disk_answers_who_only_asks(furnis
             session_id = begin(service, 3)
         for is_killed in (False, True):
             with no_room_left(folder, service), Service(data_dir, ready=False) as service:
-                view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+                view = service.answer_to("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
                 assert view["map_version"] == 2
-                assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
+                assert service.answer_to("GET", f"/v1/sessions/{session_id}")["n_observations"] == 3
                 assert service.ask("GET", "/readyz").status_code == 503
-                assert service.refused("POST", "/v1/domains/loop/sessions", json={})["status"] == 503
+                assert service.problem_of("POST", "/v1/domains/loop/sessions", json={})["status"] == 503
                 if is_killed:
                     service.kill()
         with Service(data_dir) as service:
-            assert service.told("POST", **service.observe(session_id, 3))["n_observations"] == 4
+            assert service.answer_to("POST", **service.observe(session_id, 3))["n_observations"] == 4
         check_is_clean(data_dir)
 
 
 def test_a_job_that_finds_the_disk_full_says_so_and_leaves_nothing(furnished: Path) -> None:
-    """Even where that itself cannot be written before there is room again."""
+    """The job's failure is kept though it cannot be written before there is room again."""
     with small_disk(48 * 2**20) as folder:
         data_dir = Path(shutil.copytree(furnished, folder / "data"))
-        before = sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir())
+        names = sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir())
         with Service(data_dir) as service:
-            service.told("POST", "/v1/admin/domains/yard/traverses/drive/frames", content=batch(60, 2000), headers=NPZ)
-            job_id = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP | {"training_episodes": 20_000})[
-                "job_id"
-            ]
+            service.answer_to(
+                "POST", "/v1/admin/domains/yard/traverses/drive/frames", content=batch(60, 2000), headers=NPZ
+            )
+            job_id = service.answer_to(
+                "POST", "/v1/admin/domains/yard/remaps", json=REMAP | {"training_episodes": 20_000}
+            )["job_id"]
             with no_room_left(folder, service):
-                view = service.told("POST", "/v1/domains/yard/localizations", json={"ranked_landmarks": [1, 2, 3]})
+                view = service.answer_to("POST", "/v1/domains/yard/localizations", json={"ranked_landmarks": [1, 2, 3]})
                 assert view["map_version"] == 1
                 service.logged("a job failed")
             job = service.ended_job(job_id)
             assert (job["state"], job["error"]["code"]) == ("failed", "unavailable"), job
             assert "no space is left" in job["error"]["detail"]
-            assert sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir()) == before
-            job = service.told("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
+            assert sorted(path.name for path in (data_dir / "domains/yard/maps").iterdir()) == names
+            job = service.answer_to("POST", "/v1/admin/domains/yard/remaps", json=REMAP)
             assert service.ended_job(job["job_id"])["state"] == "succeeded"
         check_is_clean(data_dir)
 
 
-@pytest.mark.parametrize("what", ["backup", "restore", "export", "import"])
-def test_commands_leave_no_half_file(furnished: Path, tmp_path: Path, what: str) -> None:
+@pytest.mark.parametrize("command_name", ["backup", "restore", "export", "import"])
+def test_commands_leave_no_half_file(furnished: Path, tmp_path: Path, command_name: str) -> None:
     source = Path(shutil.copytree(furnished, tmp_path / "data"))
     assert command("backup", tmp_path / "b.tar", "--data-dir", source).code == 0
     assert command("export", "loop", tmp_path / "m.map", "--data-dir", source).code == 0
-    with small_disk(16 * 1024 if what == "export" else 64 * 1024) as folder:
+    with small_disk(16 * 1024 if command_name == "export" else 64 * 1024) as folder:
         ran = {
             "backup": lambda: command("backup", folder / "b.tar", "--data-dir", source),
             "restore": lambda: command("restore", tmp_path / "b.tar", "--data-dir", folder / "there"),
             "export": lambda: command("export", "loop", folder / "m.map", "--data-dir", source),
             "import": lambda: command("import", tmp_path / "m.map", "--data-dir", folder),
-        }[what]()
+        }[command_name]()
         assert "no space is left" in ran.line, ran
-        if what != "import":
+        if command_name != "import":
             assert list(folder.iterdir()) == []
         else:
             assert not list(folder.rglob("maps/*"))
@@ -188,9 +190,9 @@ def test_the_end_of_a_job_is_noted_once_there_is_room(tmp_path: Path) -> None:
             assert catalog.job(job.job_id).state is JobState.RUNNING
             catalog._db.execute("PRAGMA max_page_count = 1000000")
             give_up = time.monotonic() + 60
-            while (found := catalog.job(job.job_id)).state is JobState.RUNNING:
+            while (record := catalog.job(job.job_id)).state is JobState.RUNNING:
                 assert time.monotonic() < give_up
                 time.sleep(0.05)
-            assert (found.state, found.error and found.error["code"]) == (JobState.FAILED, "invalid_map_config")
+            assert (record.state, record.error and record.error["code"]) == (JobState.FAILED, "invalid_map_config")
         finally:
             runner.close()

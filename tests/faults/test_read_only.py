@@ -1,4 +1,4 @@
-"""A disk that may not be written: who asks is answered, who would write is told, and nothing is tried twice."""
+"""On a disk that may not be written reading commands answer, and writing ones say so in one line."""
 
 import json
 import shutil
@@ -34,9 +34,9 @@ def unprivileged(*commands: tuple[object, ...]) -> list[Ran]:
     """Run commands of `deepsimbad`, one after the other, as somebody who may not write everywhere."""
     words = json.dumps([[str(word) for word in command] for command in commands])
     program = [sys.executable, "-c", UNPRIVILEGED, "-c", COMMANDS, words]
-    done = subprocess.run(program, cwd=PROJECT, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return [Ran(*told) for told in json.loads(done.stdout)]
+    process = subprocess.run(program, cwd=PROJECT, capture_output=True, text=True, check=False, timeout=120)
+    assert process.returncode == 0, process.stderr
+    return [Ran(*fields) for fields in json.loads(process.stdout)]
 
 
 @pytest.fixture(scope="module")
@@ -55,28 +55,30 @@ def read_only(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 
 def test_the_service_does_not_start(read_only: Path) -> None:
-    new = ("--create", "--data-dir", read_only / "new")
-    there, made = unprivileged(*(("serve", "--port", 0, *more) for more in (("--data-dir", read_only), new)))
-    assert (there.code, there.out, made.code, made.out) == (1, "", 1, "")
-    assert there.err.splitlines()[-1] == f"deepsimbad: unavailable: {read_only.name}: it may not be written"
-    assert made.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
+    new_dir = ("--create", "--data-dir", read_only / "new")
+    old_dir_run, new_dir_run = unprivileged(
+        *(("serve", "--port", 0, *options) for options in (("--data-dir", read_only), new_dir))
+    )
+    assert (old_dir_run.code, old_dir_run.out, new_dir_run.code, new_dir_run.out) == (1, "", 1, "")
+    assert old_dir_run.err.splitlines()[-1] == f"deepsimbad: unavailable: {read_only.name}: it may not be written"
+    assert new_dir_run.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
 
 
 def test_who_would_write_is_told_in_one_line(read_only: Path) -> None:
-    """Into it, or into a backup or export beside what it holds."""
-    into = (("delete-domain", "loop", "--yes"), ("keys", "create", "--scope", "admin"))
-    beside = (("backup", read_only / "b.tar"), ("export", "loop", read_only / "m.map"))
-    for ran in unprivileged(*((*words, "--data-dir", read_only) for words in into + beside)):
+    """The commands would change the data directory, or write a backup or an export into it."""
+    changes = (("delete-domain", "loop", "--yes"), ("keys", "create", "--scope", "admin"))
+    exports = (("backup", read_only / "b.tar"), ("export", "loop", read_only / "m.map"))
+    for ran in unprivileged(*((*words, "--data-dir", read_only) for words in changes + exports)):
         assert "may not be written" in ran.line or "cannot be opened" in ran.line
     assert not [*read_only.glob("*b.tar*"), *read_only.glob("*m.map*")]
 
 
 def test_who_asks_is_answered_and_it_can_be_checked_and_backed_up(read_only: Path, tmp_path: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in read_only.rglob("*")}
-    asked = (("info", "loop"), ("check",), ("backup", tmp_path / "b.tar"))
-    info, *others = unprivileged(*((*words, "--data-dir", read_only) for words in asked))
+    times_ns = {path: path.stat().st_mtime_ns for path in read_only.rglob("*")}
+    commands = (("info", "loop"), ("check",), ("backup", tmp_path / "b.tar"))
+    info, *other_runs = unprivileged(*((*words, "--data-dir", read_only) for words in commands))
     assert info.code == 0
-    assert [(ran.code, ran.out) for ran in others] == [(0, "")] * 2, others
-    assert {path: path.stat().st_mtime_ns for path in read_only.rglob("*")} == before
+    assert [(ran.code, ran.out) for ran in other_runs] == [(0, "")] * 2, other_runs
+    assert {path: path.stat().st_mtime_ns for path in read_only.rglob("*")} == times_ns
     assert command("restore", tmp_path / "b.tar", "--data-dir", tmp_path / "there").code == 0
     assert command("check", "--data-dir", tmp_path / "there").code == 0

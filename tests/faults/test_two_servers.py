@@ -22,13 +22,13 @@ def test_the_second_refuses_before_it_listens(data_dir: Path, tmp_path: Path) ->
         assert "Uvicorn running" not in ran.err
         (data_dir / "service.lock").unlink()  # it only tells whose the folder is
         assert "data_dir_in_use" in command("serve", "--port", 0, "--data-dir", data_dir).err.splitlines()[-1]
-        assert service.told("POST", **service.observe(session_id, 3))["n_observations"] == 4
+        assert service.answer_to("POST", **service.observe(session_id, 3))["n_observations"] == 4
         assert command("backup", tmp_path / "b.tar", "--data-dir", data_dir).code == 0
         assert "another service" in command("restore", tmp_path / "b.tar", "--data-dir", data_dir).line
         assert command("info", "loop", "--data-dir", data_dir).code == 0, "a command is no service"
         service.kill()
     with Service(data_dir) as service:
-        assert service.told("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
+        assert service.answer_to("GET", f"/v1/sessions/{session_id}")["n_observations"] == 4
     check_is_clean(data_dir)
 
 
@@ -37,12 +37,12 @@ def test_nothing_is_acknowledged_into_a_file_that_is_gone(data_dir: Path) -> Non
         session_id = begin(service)
         (data_dir / "sessions.sqlite").unlink()
         for request in (service.observe(session_id, 3), {"path": "/v1/domains/loop/sessions", "json": {}}):
-            problem = service.refused("POST", **request)
+            problem = service.problem_of("POST", **request)
             assert (problem["status"], problem["code"]) == (503, "damaged_file")
             assert "sessions.sqlite was removed under the running service" in problem["detail"]
         give_up = time.monotonic() + 120
         while service.ask("GET", "/readyz").status_code != 503:  # it looks once a second
             assert time.monotonic() < give_up
             time.sleep(0.1)
-        view = service.told("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
+        view = service.answer_to("POST", "/v1/domains/loop/localizations", json={"ranked_landmarks": [1, 2, 3]})
         assert view["map_version"] == 2
