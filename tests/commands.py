@@ -1,4 +1,4 @@
-"""Both commands in this process: a new one for each would spend a second and a half on its imports."""
+"""Both commands run in this process: a new process would spend a second and a half on its imports."""
 
 import io
 import re
@@ -23,7 +23,7 @@ class Ran:
 
     @property
     def line(self) -> str:
-        """The one line on standard error that a named error is."""
+        """The one line on standard error that tells a named error."""
         assert (self.code, self.out) == (1, ""), self
         (line,) = self.err.splitlines()
         assert re.match(r"deepsimbad: [a-z_]+: ", line)
@@ -36,7 +36,7 @@ def is_plain(text: str) -> bool:
 
 
 def ran(text: str | list[object], folder: Path | None = None, **environment: str) -> Ran:
-    """A command, by its line or its words, in a folder."""
+    """Run a command, given as a line or as words, in a folder."""
     program, *arguments = shlex.split(text) if isinstance(text, str) else map(str, text)
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patched, redirect_stdout(out), redirect_stderr(err):

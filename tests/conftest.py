@@ -58,7 +58,7 @@ def real_data() -> Path:
 
 @contextmanager
 def one_at_a_time(shared: Path, name: str) -> Iterator[None]:
-    """Others that share the folder wait with what is called the same."""
+    """A block that only one process at a time runs, among those that share the folder and the name."""
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
@@ -81,7 +81,7 @@ def rendered(shared) -> Path:
 
 @cache
 def _compile(shared: Path) -> None:
-    """In a new checkout the first test process compiles the kernels for all, half a minute that each would spend."""
+    """Compile the kernels once for all test processes: in a new checkout each would spend half a minute on it."""
     from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - seconds that a single file may do without
 
     from .commands import ran  # noqa: PLC0415
@@ -95,14 +95,14 @@ def _compile(shared: Path) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Before all that a test asks for; what is packaged brings its own kernels, and need not wait for these."""
+    """Compile the kernels before any fixture of a test; tests of packaging bring their own and need not wait."""
     if "PYTEST_XDIST_WORKER" in os.environ and item.path.parent.name != "packaging":
         _compile(Path(item.config.option.basetemp).parent)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _forked() -> Iterator[None]:
-    """A service that is no more than asked is forked rather than begun anew."""
+    """Let services be forked rather than started anew."""
     with pytest.MonkeyPatch.context() as patched:
         forking = SimpleNamespace(**{**vars(subprocess), "Popen": fork_server.Popen})
         patched.setattr(local_server, "subprocess", forking)
@@ -112,7 +112,7 @@ def _forked() -> Iterator[None]:
 
 @pytest.fixture
 def _logging_as_before():
-    """For tests that configure logging as a service does."""
+    """Restore the loggers after a test that configures logging as a service does."""
     loggers = [logging.getLogger(name) for name in (None, "deepsimbad", "uvicorn", "uvicorn.error", "uvicorn.access")]
     levels, handlers = [logger.level for logger in loggers], logging.getLogger().handlers[:]
     yield
@@ -123,14 +123,14 @@ def _logging_as_before():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """One process more than cores: many tests wait for a service that they have begun."""
+    """One process more than cores, since many tests wait for a service that they have started."""
     return len(os.sched_getaffinity(0)) + 1
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first, so that no process is left alone with one at the end.
+    """Sort files with slow tests first, so that no process is left alone with one at the end.
 
-    What is packaged begins: it has something to do while another process compiles the kernels.
+    Tests of packaging come before all: they have something to do while another process compiles the kernels.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: (item.path not in slow, item.path.parent.name != "packaging"))

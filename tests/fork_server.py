@@ -1,8 +1,9 @@
-"""Services, and their jobs, of a process that has imported them once: of a start most are imports.
+"""A fork server for services and their jobs: it has imported them once, which takes most of a start.
 
-`Popen` is the standard library's, but for these two commands it asks the fork server, which every process of tests has
-of its own, and every service that it began: what comes is a child of the caller like any other, with the arguments,
-environment, folder, group and streams it was given. Tests of the start itself take the standard library's.
+`Popen` is the standard library's, except that it has the fork server start these two commands. Every process of tests
+has its own fork server, and so has every service that was started so. The child is the caller's like any other, with
+the arguments, environment, folder, group and streams that were given. Tests of the start itself take the standard
+library's.
 """
 
 import ctypes
@@ -21,14 +22,14 @@ from pathlib import Path
 
 COMMANDS = (["-m", "deepsimbad", "serve"], ["-P", "-m", "deepsimbad.jobs.child"])
 PROJECT = Path(__file__).resolve().parents[1]
-# Of a start, what takes the longest.
+# The imports that take the longest.
 IMPORTED = ("deepsimbad.api.server", "deepsimbad.cli.serve", "anyio._backends._asyncio", "uvicorn.protocols.http.auto")
 PR_SET_CHILD_SUBREAPER = 36
 ARGUMENTS = inspect.signature(subprocess.Popen._execute_child)
 
 
 def read_by_imports(environment):
-    """What may count when something is imported; here that is told to compute in one thread, which waits for none."""
+    """The variables that imports may read; one thread for computing is no difference, for imports wait for none."""
     read_later = ("DEEPSIMBAD_", "PYTEST_", "OPENBLAS_THREAD_TIMEOUT")
     return {
         name: value
@@ -38,26 +39,26 @@ def read_by_imports(environment):
 
 
 class ForkServer:
-    """The process that forks, from the first start that asks for it to the end of this one."""
+    """The process that forks, which lives from the first start that needs it to the end of this process."""
 
     def __init__(self):
         self._turn, self._channel, self._environment = threading.Lock(), None, {}
 
-    def takes(self, asked):
-        """Whether a child forked here would be as one that begins anew."""
-        unusual = [asked[name] for name in ("executable", "preexec_fn", "pass_fds", "shell", "start_new_session")]
-        program, *words = map(str, asked["args"])
-        given = read_by_imports(os.environ if asked["env"] is None else asked["env"])
+    def takes(self, arguments):
+        """Whether a forked child would be like one that is started anew with these arguments of `Popen`."""
+        unusual = [arguments[name] for name in ("executable", "preexec_fn", "pass_fds", "shell", "start_new_session")]
+        program, *words = map(str, arguments["args"])
+        environment = read_by_imports(os.environ if arguments["env"] is None else arguments["env"])
         return (
             sys.platform == "linux"
             and not any(unusual)
             and program == sys.executable
             and any(words[: len(command)] == command for command in COMMANDS)
-            and given == (self._environment or read_by_imports(os.environ))
+            and environment == (self._environment or read_by_imports(os.environ))
         )
 
     def fork(self, start, streams):
-        """The number of the child; for a moment whoever has lost its parent below this process becomes its child."""
+        """Fork a child and return its id; for a moment this process adopts the orphans below it."""
         libc = ctypes.CDLL(None)
         with self._turn:
             if self._channel is None:
@@ -77,7 +78,7 @@ class ForkServer:
             self._process = subprocess.Popen(command, cwd=PROJECT, pass_fds=[its.fileno()], stdin=subprocess.DEVNULL)
 
     def divide(self):
-        """Begin as a copy of this process, which has imported all and is about to do something else."""
+        """Start the fork server as a copy of this process, which has imported all and goes on to something else."""
         self._channel, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._environment = read_by_imports(os.environ)
         if os.fork() == 0:
@@ -90,7 +91,7 @@ class ForkServer:
         its.close()
 
     def close(self):
-        """Children live on."""
+        """End the fork server; its children live on."""
         if self._channel is not None:
             self._channel.close()
             self._process.wait()
@@ -100,19 +101,19 @@ SERVER = ForkServer()
 
 
 class Popen(subprocess.Popen):
-    """A child, of the fork server where it makes no difference."""
+    """A child process, started by the fork server where that makes no difference."""
 
-    def _execute_child(self, *given):
-        asked = ARGUMENTS.bind(self, *given).arguments
-        if not SERVER.takes(asked):
-            super()._execute_child(*given)
+    def _execute_child(self, *values):
+        arguments = ARGUMENTS.bind(self, *values).arguments
+        if not SERVER.takes(arguments):
+            super()._execute_child(*values)
             return
-        pipes = [asked[name] for name in ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")]
+        pipes = [arguments[name] for name in ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")]
         start = {
-            "words": list(map(str, asked["args"])),
-            "folder": os.fspath(asked["cwd"] or Path.cwd()),
-            "environment": dict(os.environ if asked["env"] is None else asked["env"]),
-            "group": asked["process_group"],
+            "words": list(map(str, arguments["args"])),
+            "folder": os.fspath(arguments["cwd"] or Path.cwd()),
+            "environment": dict(os.environ if arguments["env"] is None else arguments["env"]),
+            "group": arguments["process_group"],
         }
         streams = [number if pipe == -1 else pipe for number, pipe in enumerate((pipes[0], pipes[3], pipes[5]))]
         try:
@@ -123,7 +124,7 @@ class Popen(subprocess.Popen):
 
 
 def orphan(pipe):
-    """Whether this is a new process that has lost its parent; the old one is told its number through the pipe."""
+    """Fork an orphan and return whether this is it; its id is written to the pipe."""
     if (parent := os.fork()) == 0:
         if (child := os.fork()) == 0:
             return True
@@ -152,7 +153,7 @@ def begin(start, streams):
 
 
 def serve(channel):
-    """Until nobody can ask any more."""
+    """Fork on request until the other end of the channel is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # meant for others
     reader, writer = os.pipe()
     while True:

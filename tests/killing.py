@@ -17,12 +17,12 @@ FILE_STEPS = {"rename", "unlink", "rmtree", "fsync", "mkdir", "rmdir", "chmod", 
 SQL_STEPS = {"execute", "executemany"}
 PROJECT = Path(__file__).resolve().parents[1]
 
-Told = list[str]  # words that the child told before it died
+Words = list[str]  # that the child wrote before it died
 
 
-def expect(truth: bool, what: str) -> None:
-    if not truth:
-        raise SystemExit(f"broken: {what}")
+def expect(is_true: bool, claim: str) -> None:
+    if not is_true:
+        raise SystemExit(f"broken: {claim}")
 
 
 def _kill_at(fatal_step: int, steps: set[str]) -> Callable[[object, str, object], None]:
@@ -47,13 +47,13 @@ def kill_at_every_step(
     plans: Iterable[tuple[set[str], int]],
     prepare: Callable[[Path], object],
     run: Callable[[Path, Callable[[str], None]], object],
-    check: Callable[[Path, Told], None],
+    check: Callable[[Path, Words], None],
     set_profile: Callable[[object], None] = sys.setprofile,
 ) -> None:
-    """Print for each plan, kinds of steps and a stride, how many steps there are; `run` is told how to tell a word."""
+    """Print for each plan (kinds of steps, stride) how many steps there are; `run` gets a function to tell a word."""
     for steps, step_by in plans:
-        fatal_step, survived = 1, False
-        while not survived:
+        fatal_step, has_survived = 1, False
+        while not has_survived:
             data_dir = folder / "killed"
             prepare(data_dir)
             reader, writer = os.pipe()
@@ -65,15 +65,15 @@ def kill_at_every_step(
                 os._exit(0)
             os.close(writer)
             _, status = os.waitpid(child, 0)
-            told = os.read(reader, 1000).decode().split()
+            words = os.read(reader, 1000).decode().split()
             os.close(reader)
-            survived = not os.WIFSIGNALED(status)
-            expect(status == (0 if survived else signal.SIGKILL), f"the child ended with {status} after {told}")
+            has_survived = not os.WIFSIGNALED(status)
+            expect(status == (0 if has_survived else signal.SIGKILL), f"the child ended with {status} after {words}")
             try:
-                check(data_dir, told)
+                check(data_dir, words)
             except BaseException as error:
                 raise SystemExit(
-                    f"killed at step {fatal_step} of {len(steps)} kinds after {told}: {error!r}"
+                    f"killed at step {fatal_step} of {len(steps)} kinds after {words}: {error!r}"
                 ) from error
             shutil.rmtree(data_dir)
             fatal_step += step_by
@@ -81,8 +81,8 @@ def kill_at_every_step(
 
 
 def steps_of(driver: str, *arguments: object) -> list[int]:
-    """Run a driver, which must find nothing broken; how many steps of each plan it tried."""
-    done = subprocess.run(
+    """Run a driver, which must find nothing broken; returns how many steps of each plan it tried."""
+    process = subprocess.run(
         [sys.executable, "-m", driver, *map(str, arguments)],
         capture_output=True,
         text=True,
@@ -90,5 +90,5 @@ def steps_of(driver: str, *arguments: object) -> list[int]:
         cwd=PROJECT,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
     )
-    assert done.returncode == 0, done.stderr
-    return [int(word) for word in done.stdout.split()]
+    assert process.returncode == 0, process.stderr
+    return [int(word) for word in process.stdout.split()]

@@ -8,9 +8,9 @@ NEEDED = ("click", "cv2", "matplotlib", "numpy", "rich")
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        sys.stderr.write(f"{', '.join(missing)} not installed: pip install 'deep-simbad[replay]'\n")
+    missing_names = [name for name in NEEDED if find_spec(name) is None]
+    if missing_names:
+        sys.stderr.write(f"{', '.join(missing_names)} not installed: pip install 'deep-simbad[replay]'\n")
         sys.exit(1)
     try:
         from deepsimbad_client.commands import run  # noqa: PLC0415 - only now are its packages known to be installed

@@ -23,10 +23,10 @@ def test_with_as_many_entries_as_places_nothing_is_lost_and_with_few_some_is(row
 def test_medoids_are_distinct_rows_of_every_cluster(rows):
     clusters = unit(np.repeat(rows[:5], 30, axis=0) + 0.01 * np.random.default_rng(1).normal(size=(150, 12)))
     assert len(set(medoids(clusters, 150))) == 150
-    assert {chosen // 30 for chosen in medoids(clusters, 20)} == set(range(5))
+    assert {row // 30 for row in medoids(clusters, 20)} == set(range(5))
 
 
 def test_a_beam_of_one_takes_the_nearest_landmark_first(rows):
     lists = greedy(rows, rows[:20], None)
     assert np.array_equal(lists[0], (rows @ rows[:20].T).argmax(axis=1))
-    assert all(len(set(each)) == 4 for each in lists.T)
+    assert all(len(set(column)) == 4 for column in lists.T)

@@ -1,4 +1,4 @@
-"""The remap's section says of every limit whether it is kept."""
+"""The remap's section shows for every limit whether it is kept."""
 
 from dataclasses import replace
 

@@ -22,7 +22,7 @@ N_FRAMES = 24
 
 
 def pictures(folder: Path, seed: int) -> Path:
-    """A drive past walls of colours, each picture a little like its neighbours; a season is noise."""
+    """A folder of pictures of a drive past coloured walls, each a little like its neighbours; a season is noise."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
     wall = cv2.resize(np.random.default_rng(7).integers(0, 255, (8, 90, 3), np.uint8), (1800, 160))
@@ -39,7 +39,7 @@ def drives(tmp_path_factory) -> dict[str, Path]:
 
 
 def make_domain(url: str, name: str, drive: Path | None, **headers: str) -> None:
-    """A domain on a loop, mapped where there is a drive."""
+    """Make a domain on a loop, and its map if there is a drive."""
     with httpx2.Client(base_url=url, headers=headers, timeout=120) as client:
         body = {"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}, "thumbnails": True}
         client.put(f"/v1/admin/domains/{name}", json=body).raise_for_status()
@@ -71,7 +71,7 @@ def service(tmp_path_factory, drives):
 
 @pytest.fixture(scope="module")
 def chromium():
-    """One browser for a file: as long as it is open an event loop runs, in which no other test could begin its own."""
+    """One browser for each test file: while it is open, no other test could start an event loop."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed: apt-get install chromium")
@@ -83,10 +83,10 @@ def chromium():
 
 @pytest.fixture
 def open_page(chromium, service):
-    """Opens a page of the console; whatever the page complains of fails the test, unless it was expected."""
+    """Opens a page of the console; any complaint of the page fails the test, unless it was expected."""
     contexts, complaints = [], []
 
-    def open_(where: str = "", url: str | None = None, expected: str = "\0", **options):
+    def open_(fragment: str = "", url: str | None = None, expected: str = "\0", **options):
         context = chromium.new_context(**options)
         contexts.append(context)
         page = context.new_page()
@@ -98,7 +98,7 @@ def open_page(chromium, service):
 
         page.on("console", lambda message: complain(message.text) if message.type in {"error", "warning"} else None)
         page.on("pageerror", lambda error: complain(str(error)))
-        page.goto(f"{url or service}/console#{where}")
+        page.goto(f"{url or service}/console#{fragment}")
         return page
 
     yield open_

@@ -47,7 +47,7 @@ def campus(folder: Path) -> Iterator[tuple[str, dict[str, Recording]]]:
 
 
 def drive(client: Client, drive: Recording, first: int, n_views: int) -> str:
-    """A session that has seen so many views; its id."""
+    """Drive a session over so many views; returns its id."""
     session = client.session("campus", keep=True)
     for row in range(first, first + n_views * STEP, STEP):
         moved_m = drive.frames[row].position_m - drive.frames[row - STEP].position_m
@@ -55,9 +55,9 @@ def drive(client: Client, drive: Recording, first: int, n_views: int) -> str:
     return session.session_id
 
 
-def shown(page: Page, url: str, where: str) -> None:
+def open_page(page: Page, url: str, fragment: str) -> None:
     """Open a page and wait until it rests."""
-    page.goto(f"{url}/console#{where}")
+    page.goto(f"{url}/console#{fragment}")
     page.reload()
     page.wait_for_timeout(1500)
 
@@ -69,7 +69,7 @@ def small(png: bytes, path: Path) -> None:
 
 
 def main() -> None:
-    """Take them."""
+    """Take the pictures."""
     everything = Path(sys.argv[1]) if sys.argv[1:] else None
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -83,16 +83,16 @@ def main() -> None:
         picture = {"name": "view.jpg", "mimeType": view.content_type, "buffer": view.body}
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET, chromium_sandbox=False)
         if everything is None:
-            for name, where, scheme in (
+            for name, fragment, scheme in (
                 ("console-domain", "domains/campus", "light"),
                 ("console-session", f"sessions/{session}", "dark"),
             ):
                 tall = {**DESK, "height": HEIGHT_SHOWN}
                 page = browser.new_context(viewport=tall, color_scheme=scheme).new_page()
-                shown(page, url, where)
+                open_page(page, url, fragment)
                 small(page.screenshot(), IMAGES / f"{name}.webp")
             page = browser.new_context(viewport=PHONE, color_scheme="light", device_scale_factor=1.5).new_page()
-            shown(page, url, f"sessions/{session}")
+            open_page(page, url, f"sessions/{session}")
             small(page.screenshot(), IMAGES / "console-phone.webp")
             return
         everything.mkdir(parents=True, exist_ok=True)
@@ -113,8 +113,8 @@ def main() -> None:
         for scheme in ("light", "dark"):
             for width, viewport in (("desk", DESK), ("phone", PHONE)):
                 page = browser.new_context(viewport=viewport, color_scheme=scheme).new_page()
-                for name, where in pages.items():
-                    shown(page, url, where)
+                for name, fragment in pages.items():
+                    open_page(page, url, fragment)
                     if name == "tried":
                         page.set_input_files("input[type=file]", picture)
                         page.get_by_text("After this one view").wait_for()

@@ -43,7 +43,7 @@ DROPPED = """([name, type, bytes]) => {
 
 
 def drop(page, path, kind):
-    """Let go of a file over the page's heading, beside every place that is made for it."""
+    """Drop a file on the page's heading, outside every drop area."""
     carried = page.evaluate_handle(DROPPED, [path.name, kind, list(path.read_bytes())])
     for event in ("dragover", "drop"):
         page.dispatch_event("h1", event, {"dataTransfer": carried})
@@ -64,7 +64,7 @@ def session(service, drives):
 
 @pytest.fixture
 def pages(service, session):
-    """Every page by a text of it, a session's and a job's own among them."""
+    """By fragment a text of every page, those of a session and a job included."""
     with httpx2.Client(base_url=service) as caller:
         job = caller.get("/v1/admin/jobs").json()["jobs"][0]["job_id"]
     return {**PAGES, f"sessions/{session.session_id}": "After 3 views", f"jobs/{job}": "What was measured"}
@@ -74,18 +74,18 @@ def pages(service, session):
 def test_every_page_is_whole_and_accessible(open_page, pages, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
     page = open_page(color_scheme=scheme, viewport=DESK, bypass_csp=True)
-    for where, text in pages.items():
-        page.goto(page.url.partition("#")[0] + f"#{where}")
+    for fragment, text in pages.items():
+        page.goto(page.url.partition("#")[0] + f"#{fragment}")
         page.get_by_text(text).first.wait_for()
         for width in (PHONE, DESK):
             page.set_viewport_size(width)
-            assert page.evaluate(TOO_WIDE) == [], where
-            found = axe.run(page)
-            assert found.violations_count == 0, f"{where}: {found.generate_report()}"
+            assert page.evaluate(TOO_WIDE) == [], fragment
+            report = axe.run(page)
+            assert report.violations_count == 0, f"{fragment}: {report.generate_report()}"
 
 
 @pytest.mark.parametrize(
-    ("where", "advice"),
+    ("fragment", "advice"),
     [
         ("domains/none", "Choose one under Domains"),
         ("domains/none/upload", "Choose one under Domains"),
@@ -94,8 +94,8 @@ def test_every_page_is_whole_and_accessible(open_page, pages, scheme):
         ("jobs/none", "Choose one under Jobs"),
     ],
 )
-def test_what_is_not_there_is_said_once_and_what_to_do(open_page, where, advice):
-    page = open_page(where, expected="404", viewport=PHONE)
+def test_what_is_not_there_is_said_once_and_what_to_do(open_page, fragment, advice):
+    page = open_page(fragment, expected="404", viewport=PHONE)
     page.get_by_role("alert").get_by_text(advice).wait_for()
     assert page.get_by_role("alert").count() == 1
     assert page.get_by_role("alert").evaluate("(alert) => alert.scrollWidth <= alert.clientWidth")
@@ -112,17 +112,17 @@ REACHED = """(() => {
 
 def test_the_keyboard_reaches_all_of_every_page(open_page, session, pages):
     page = open_page()
-    for where, text in pages.items():
-        page.goto(page.url.partition("#")[0] + f"#{where}")
+    for fragment, text in pages.items():
+        page.goto(page.url.partition("#")[0] + f"#{fragment}")
         page.get_by_text(text).first.wait_for()
-        if where == "report":  # a frame that is still loading takes no focus
+        if fragment == "report":  # a frame that is still loading takes no focus
             page.frame_locator("iframe").get_by_label("or choose a file").wait_for()
         page.wait_for_timeout(300)
         for _ in range(page.evaluate(f"{REACHABLE}.length") + 4):
             page.keyboard.press("Tab")
-            assert page.evaluate(REACHED), f"{where}: the focus is not seen"
+            assert page.evaluate(REACHED), f"{fragment}: the focus is not seen"
         missed = page.evaluate(f"{REACHABLE}.filter((part) => !part.reached).map((part) => part.outerHTML)")
-        assert missed == [], where
+        assert missed == [], fragment
     page.goto(page.url.partition("#")[0] + f"#sessions/{session.session_id}")
     slider = page.get_by_label("Step shown")
     slider.press("ArrowLeft")
@@ -157,17 +157,17 @@ def test_a_chart_of_one_view_shows_it_and_its_numbers_fit(open_page, service, dr
         drive(client, live, drives["winter"], range(5, 6))
         page = open_page(f"sessions/{live.session_id}")
         page.get_by_text("After 1 view", exact=True).wait_for()
-        written = """(plot) => {
+        label_room = """(plot) => {
             const letters = document.createElement("canvas").getContext("2d");
             letters.font = "12px system-ui, sans-serif";
             return parseFloat(plot.style.left) - 15 - letters.measureText("100 %").width;
         }"""
-        assert page.locator(".u-over").first.evaluate(written) >= 0
-        coloured = """(canvas) => {
+        assert page.locator(".u-over").first.evaluate(label_room) >= 0
+        has_colour = """(canvas) => {
             const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
             return data.some((red, i) => i % 4 === 0 && data[i + 3] === 255 && data[i + 2] - red > 80);
         }"""
-        assert page.locator(".u-wrap canvas").last.evaluate(coloured)
+        assert page.locator(".u-wrap canvas").last.evaluate(has_colour)
 
 
 def test_landmarks_are_shown_by_the_frames_they_began_as(open_page):
@@ -256,12 +256,12 @@ def test_an_image_is_tried_and_an_episode_gone_through(open_page, drives):
     page = open_page("try/route", bypass_csp=True)
     page.set_input_files("input[type=file]", drives["winter"] / "009.jpg")
     page.get_by_text("After this one view").wait_for()
-    assert (found := axe.run(page)).violations_count == 0, found.generate_report()
+    assert (report := axe.run(page)).violations_count == 0, report.generate_report()
     assert page.get_by_alt_text("The view").is_visible()
-    for motion, taken in (("reduce", "0s"), ("no-preference", "0.15s")):
+    for motion, duration in (("reduce", "0s"), ("no-preference", "0.15s")):
         page.emulate_media(reduced_motion=motion)
         bar = page.locator(".moves .fill").first
-        assert bar.evaluate("(bar) => getComputedStyle(bar).transitionDuration") == taken
+        assert bar.evaluate("(bar) => getComputedStyle(bar).transitionDuration") == duration
     page.get_by_role("button", name="key").press("Enter")
     page.get_by_role("dialog", name="API key").press("Escape")
     assert page.get_by_text("After this one view").is_visible(), "a dialog that is left changes nothing"
@@ -272,7 +272,7 @@ def test_an_image_is_tried_and_an_episode_gone_through(open_page, drives):
     page.get_by_label("Metres driven since the last view").fill("2")
     drop(page, drives["winter"] / "010.jpg", "image/jpeg")
     page.get_by_text("After 2 views").wait_for()
-    assert (found := axe.run(page)).violations_count == 0, found.generate_report()
+    assert (report := axe.run(page)).violations_count == 0, report.generate_report()
     page.get_by_role("button", name="End the episode").press("Enter")
     page.get_by_text("Drop an image of the route here").wait_for()
     (drives["winter"].parent / "broken.jpg").write_bytes(b"no picture")
@@ -320,8 +320,8 @@ def test_an_upload_is_paused_and_goes_on_without_what_is_no_picture(open_page, s
     page.get_by_text("Make a domain").click()
     page.get_by_label("Name: letters").fill("paused")
     page.get_by_role("button", name="Make it").click()
-    held = []
-    page.route("**/frames/5?*", lambda route, _: held.append(route))
+    routes = []
+    page.route("**/frames/5?*", lambda route, _: routes.append(route))
     page.set_input_files("input[type=file]", folder)
     page.get_by_role("button", name="Upload").click()
     page.get_by_text(f"{N_FRAMES - 1} of {N_FRAMES} images").wait_for()
@@ -351,12 +351,12 @@ def test_an_upload_goes_on_where_it_was_cut(open_page, service, drives):
                 headers={"Content-Type": "image/jpeg"},
             ).raise_for_status()
         page = open_page("domains/cut/upload")
-        sent = []
-        page.on("request", lambda request: sent.append(request.url) if request.method == "PUT" else None)
+        urls = []
+        page.on("request", lambda request: urls.append(request.url) if request.method == "PUT" else None)
         page.set_input_files("input[type=file]", drives["summer"])
         page.get_by_role("button", name="Upload").click()
         page.get_by_text(f"{N_FRAMES} of {N_FRAMES} images").wait_for()
-        assert len(sent) == N_FRAMES - 3
+        assert len(urls) == N_FRAMES - 3
         stored = caller.get(f"{base}/summer").json()
         assert (stored["n_frames"], stored["missing"]) == (N_FRAMES, [])
 
@@ -404,13 +404,13 @@ def test_a_key_is_asked_refused_and_kept_in_the_tab_alone(open_page, tmp_path, d
 
 
 def tried(folder, drives, url):
-    given = ("--evaluator", "feature_l2:gradient_grid", "--out", folder)
-    assert deepsimbad(["try", *map(str, (drives["summer"], drives["winter"], *given))]) == 0
+    options = ("--evaluator", "feature_l2:gradient_grid", "--out", folder)
+    assert deepsimbad(["try", *map(str, (drives["summer"], drives["winter"], *options))]) == 0
 
 
 def replayed(folder, drives, url):
-    given = ("--domain", "route", "--server", url, "--out", folder)
-    assert deepsimbad_client(["replay", *map(str, (drives["winter"], *given))]) == 0
+    options = ("--domain", "route", "--server", url, "--out", folder)
+    assert deepsimbad_client(["replay", *map(str, (drives["winter"], *options))]) == 0
 
 
 def told_of_the_paper(folder, drives, url):
@@ -420,8 +420,8 @@ def told_of_the_paper(folder, drives, url):
     for date in ("2012-01-22", "2012-03-31", "2012-08-04"):
         np.save(nclt / f"{date}.npy", (places + 0.5 * rng.normal(size=places.shape)).astype(np.float32))
     small = ("--n-landmarks", 8, "--training-episodes", 20, "--episodes", 2, "--evaluator", "feature_l2:none")
-    given = ("--nclt", nclt, "--out", folder, *small)
-    assert deepsimbad(["experiment", "paper", *map(str, given)]) == 0
+    options = ("--nclt", nclt, "--out", folder, *small)
+    assert deepsimbad(["experiment", "paper", *map(str, options)]) == 0
 
 
 @pytest.mark.parametrize(

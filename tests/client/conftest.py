@@ -62,7 +62,7 @@ def encodings(tmp_path_factory):
     return folder
 
 
-def mapped(client, domain, encodings, training_episodes=0):
+def make_map(client, domain, encodings, training_episodes=0):
     """Make a domain with one map, of summer, an image every metre."""
     client.admin.put_domain(domain, ENCODINGS)
     for name in ("landmarks", "summer"):
@@ -72,7 +72,7 @@ def mapped(client, domain, encodings, training_episodes=0):
 
 
 class Link(httpx2.HTTPTransport):
-    """To the real service; `lose` is asked of every request that was answered: True, and its answer never arrives."""
+    """A transport to the real service; it loses the answer to every request for which `lose` returns True."""
 
     def __init__(self):
         super().__init__()
@@ -92,7 +92,7 @@ class Link(httpx2.HTTPTransport):
 def route(service, encodings):
     """The address of a service that has mapped the domain `route`, which tests leave as it is."""
     with Client(service) as client:
-        mapped(client, "route", encodings, training_episodes=50)
+        make_map(client, "route", encodings, training_episodes=50)
     return service
 
 
@@ -109,5 +109,5 @@ def client(route, link):
 
 @pytest.fixture
 def views(encodings):
-    """[120, 32] of winter, one every metre."""
+    """The encodings of winter, [120, 32], one every metre."""
     return np.asarray(np.load(encodings / "winter.npy"))

@@ -18,18 +18,18 @@ def test_nothing_is_cut(monkeypatch, columns, is_terminal):
     table = Table(*NAMES, title="jobs")
     for row in ROWS:
         table.add_row(*row)
-    written = io.StringIO()
-    print_whole(table, Console(file=written, width=columns, force_terminal=is_terminal, color_system=None))
-    shown = written.getvalue()
-    assert "…" not in shown
-    together = "".join(shown.split())
+    stream = io.StringIO()
+    print_whole(table, Console(file=stream, width=columns, force_terminal=is_terminal, color_system=None))
+    printed = stream.getvalue()
+    assert "…" not in printed
+    together = "".join(printed.split())
     assert all("".join(text.split()) in together for text in (*NAMES, *sum(ROWS, ())))
     is_down = is_terminal and columns < 140
-    assert ("│" in shown) == (not is_down)
-    assert not is_terminal or max(map(len, shown.splitlines())) <= columns
+    assert ("│" in printed) == (not is_down)
+    assert not is_terminal or max(map(len, printed.splitlines())) <= columns
 
 
 def test_an_empty_table_says_so():
-    written = io.StringIO()
-    print_whole(Table(*NAMES, title="jobs"), Console(file=written, width=60))
-    assert written.getvalue() == "jobs: none\n"
+    stream = io.StringIO()
+    print_whole(Table(*NAMES, title="jobs"), Console(file=stream, width=60))
+    assert stream.getvalue() == "jobs: none\n"

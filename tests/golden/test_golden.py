@@ -50,7 +50,7 @@ def deepsimbad(*arguments):
 
 
 def check(name, value):
-    """Compare with the file of that name."""
+    """Compare a value with the golden file of that name."""
     path = GOLDEN / f"{name}.json"
     text = json.dumps(value, indent=1, sort_keys=True) + "\n"
     if os.environ.get("GOLDEN_UPDATE"):
@@ -58,29 +58,29 @@ def check(name, value):
     compare(json.loads(text), json.loads(path.read_text()), path.name)
 
 
-def compare(value, golden, where):
-    """Alike but for the last digits of numbers that are no integers."""
-    assert type(value) is type(golden), where
+def compare(value, golden, path):
+    """Assert that a value equals the golden one, real numbers except for their last digits."""
+    assert type(value) is type(golden), path
     if isinstance(value, dict):
-        assert value.keys() == golden.keys(), where
+        assert value.keys() == golden.keys(), path
         for name in value:
-            compare(value[name], golden[name], f"{where} {name}")
+            compare(value[name], golden[name], f"{path} {name}")
     elif isinstance(value, list):
-        assert len(value) == len(golden), where
-        for place, (one, other) in enumerate(zip(value, golden, strict=True)):
-            compare(one, other, f"{where} {place}")
+        assert len(value) == len(golden), path
+        for place, (item, golden_item) in enumerate(zip(value, golden, strict=True)):
+            compare(item, golden_item, f"{path} {place}")
     elif isinstance(value, float):
-        assert value == pytest.approx(golden, rel=1e-4, abs=1e-7), where
+        assert value == pytest.approx(golden, rel=1e-4, abs=1e-7), path
     else:
-        assert value == golden, where
+        assert value == golden, path
 
 
 def sha256(body):
     return hashlib.sha256(body).hexdigest()
 
 
-def told(body, dtype):
-    """What is compared of an array's bytes: of real numbers some and their spread, else a digest."""
+def fingerprint(body, dtype):
+    """The part of an array's bytes that is compared: some real numbers and their spread, else a digest."""
     if not dtype.startswith("<f"):
         return sha256(body)
     numbers = np.frombuffer(body, dtype).astype(np.float64)
@@ -97,7 +97,7 @@ class Server(LocalServer):
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory):
-    """Landmarks, summer and winter of one route as ready encodings."""
+    """The folder of landmarks, summer and winter of one route as ready encodings."""
     folder = tmp_path_factory.mktemp("drives")
     rng = np.random.default_rng(11)
     places = np.cumsum(rng.normal(size=(150, 24)), axis=0)
@@ -111,15 +111,15 @@ def content(path):
     """Every table of a map file, without what a clock or a release wrote."""
     with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as file:
         tables = [row[0] for row in file.execute("select name from sqlite_master where type = 'table' order by name")]
-        held = {}
+        cells = {}
         for table in (table for table in tables if not table.startswith(("_", "sqlite_"))):
             rows = file.execute(f"select * from {table} order by 1").fetchall()
-            held[table] = [
-                [told(cell, dtype) if isinstance(cell, bytes) else cell for cell in row]
+            cells[table] = [
+                [fingerprint(cell, dtype) if isinstance(cell, bytes) else cell for cell in row]
                 for row in rows
                 for dtype in [next((cell for cell in row if isinstance(cell, str) and cell[:1] == "<"), "")]
             ]
-        return held
+        return cells
 
 
 @pytest.mark.parametrize("relevance", ["composed", "standardised", "rrf", "simbad", "brute_force"])
@@ -129,22 +129,22 @@ def test_map_file(drives, tmp_path, relevance):
         *("--evaluator", "feature_l2:none", "--n-landmarks", "60", "--relevance", relevance, "--seed", "3"),
         *("--training-episodes", "200", "--data-dir", tmp_path / "data"),
     )
-    held = content(next(tmp_path.glob("data/domains/route/maps/*.sqlite")))
-    for row in (row for rows in held.values() for row in rows):
+    cells = content(next(tmp_path.glob("data/domains/route/maps/*.sqlite")))
+    for row in (row for rows in cells.values() for row in rows):
         for place, cell in enumerate(row):
             if isinstance(cell, str) and cell[:4] == "2026" and cell[10:11] == "T":
                 row[place] = "a time"
             elif isinstance(cell, str) and cell.startswith("{"):
                 row[place] = without_clocks(json.loads(cell))
-    held["map"] = [row[:10] for row in held["map"]]  # a checksum may follow, over the times too
-    check(f"map-{relevance}", held)
+    cells["map"] = [row[:10] for row in cells["map"]]  # a checksum may follow, over the times too
+    check(f"map-{relevance}", cells)
 
 
 def without_clocks(document):
     """A JSON document without seconds, releases and digests of files that hold a time."""
     if isinstance(document, dict):
-        gone = {"seconds", "release", "timings_ms", "created_at", "expires_at", "session_id", "job_id", "encode_ms"}
-        return {name: without_clocks(value) for name, value in document.items() if name not in gone}
+        omitted = {"seconds", "release", "timings_ms", "created_at", "expires_at", "session_id", "job_id", "encode_ms"}
+        return {name: without_clocks(value) for name, value in document.items() if name not in omitted}
     if isinstance(document, list):
         return [without_clocks(value) for value in document]
     return document
@@ -156,9 +156,9 @@ def test_experiments_on_real_data(real_data, tmp_path, kind):
     folder = real_data / "nordland_netvlad64"
     train, test, landmark = (f"{path}#0:500" for path in sorted(folder.glob("*.npy"))[:3])
     out = tmp_path / "out.json"
-    more = [] if kind == "vpr" else ["--episodes", "30", "--training-episodes", "500"]
+    options = [] if kind == "vpr" else ["--episodes", "30", "--training-episodes", "500"]
     deepsimbad(
-        *("experiment", kind, "--landmarks", landmark, "--training", train, "--test", test, *more),
+        *("experiment", kind, "--landmarks", landmark, "--training", train, "--test", test, *options),
         *("--evaluator", "feature_l2:none", "--n-landmarks", "200", "--json", out),
     )
     document = without_clocks(json.loads(out.read_text()))
@@ -210,16 +210,16 @@ def test_answers_and_a_replayed_journal(drives, tmp_path):
                 view = {"encoding": winter[20 + 3 * step].tolist()}
                 answer = server.call("POST", f"{paths[name]}/observations?action_m=3", json=view).json()
             answers[name] = answer
-        before = {
+        beliefs = {
             name: server.call("GET", f"{path}/belief", headers={"Accept": "application/octet-stream"}).content
             for name, path in paths.items()
         }
-        answers |= {f"belief of {name}": np.load(io.BytesIO(body)).tolist() for name, body in before.items()}
+        answers |= {f"belief of {name}": np.load(io.BytesIO(body)).tolist() for name, body in beliefs.items()}
         server.kill()
     with Server(tmp_path / "data") as server:
         for name, path in paths.items():
-            after = server.call("GET", f"{path}/belief", headers={"Accept": "application/octet-stream"}).content
-            assert after == before[name], f"{name} went on otherwise after a restart"
+            belief = server.call("GET", f"{path}/belief", headers={"Accept": "application/octet-stream"}).content
+            assert belief == beliefs[name], f"{name} went on otherwise after a restart"
         answers["openapi"] = sha256(json.dumps(server.call("GET", "/openapi.json").json(), sort_keys=True).encode())
         check("openapi", server.call("GET", "/openapi.json").json())
     check("answers", without_clocks({**answers, "openapi": None}))
@@ -231,31 +231,34 @@ def test_help():
         ("python -m deepsimbad", commands, 78, COMMANDS),
         ("deepsimbad-client", cli, 98, [[], *([name] for name in CLIENT_COMMANDS)]),
     )
-    for program, group, width, called in programs:
-        for words in called:
-            ended = CliRunner().invoke(group, [*words, "--help"], prog_name=program, terminal_width=width)
-            assert ended.exit_code == 0, ended.output
-            texts[" ".join([program.removeprefix("python -m "), *words])] = ended.output
+    for program, group, width, command_words in programs:
+        for words in command_words:
+            result = CliRunner().invoke(group, [*words, "--help"], prog_name=program, terminal_width=width)
+            assert result.exit_code == 0, result.output
+            texts[" ".join([program.removeprefix("python -m "), *words])] = result.output
     check("help", texts)
 
 
 def test_both_commands_have_one_order_of_words():
-    """A verb, or a noun that is listed, or a group and its verb; then the domain, then what is done to what of it."""
-    ours, theirs = (
+    """Words are a verb, or a noun that is listed, or a group and its verb; then the domain; then the rest."""
+    service_commands, client_commands = (
         {name: group.get_command(Context(group), name) for name in group.list_commands(Context(group))}
         for group in (commands, cli)
     )
-    assert {name for name, command in ours.items() if isinstance(command, Group)} == {
+    assert {name for name, command in service_commands.items() if isinstance(command, Group)} == {
         *("experiment", "keys", "ray", "weights")
     }
-    assert not any(isinstance(command, Group) for command in theirs.values())
-    for command in (*ours.values(), *theirs.values()):
+    assert not any(isinstance(command, Group) for command in client_commands.values())
+    for command in (*service_commands.values(), *client_commands.values()):
         words = [parameter.human_readable_name for parameter in command.params if isinstance(parameter, Argument)]
         assert not any("DOMAIN" in word.upper() for word in words[1:]), f"{command.name} {words}"
-    same = set(ours) & set(theirs)
-    assert same == {"delete-domain", "localize"}
-    for name in same:
-        usages = {" ".join(group[name].collect_usage_pieces(Context(group[name]))) for group in (ours, theirs)}
+    common_names = set(service_commands) & set(client_commands)
+    assert common_names == {"delete-domain", "localize"}
+    for name in common_names:
+        usages = {
+            " ".join(group[name].collect_usage_pieces(Context(group[name])))
+            for group in (service_commands, client_commands)
+        }
         assert len(usages) == 1, usages
     versions = [CliRunner().invoke(group, ["--version"]).output for group in (commands, cli)]
     assert versions == [f"{version('deep-simbad')}\n"] * 2

@@ -29,7 +29,7 @@ from deepsimbad.store.records import JobState, MapState
 from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 from deepsimbad.store.traverses import Traverse
 
-from ..killing import FILE_STEPS, SQL_STEPS, Told, expect, kill_at_every_step
+from ..killing import FILE_STEPS, SQL_STEPS, Words, expect, kill_at_every_step
 
 DOMAIN, SESSION = "route", "s" * 32
 READY = {"kind": "feature_l2", "extractor": "none"}
@@ -90,7 +90,7 @@ def content(catalog: Catalog, version: int) -> dict[str, Any]:
     return asdict(replace(read_map(catalog.map_path(DOMAIN, version)), version=0, created_at=""))
 
 
-def check(data_dir: Path, told: Told, wanted: dict[str, Any]) -> None:
+def check(data_dir: Path, told: Words, wanted: dict[str, Any]) -> None:
     """Once and only once, by the next service."""
     serve(data_dir)
     with Catalog.open(data_dir) as catalog:

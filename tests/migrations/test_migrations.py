@@ -50,10 +50,10 @@ def apply(path: Path, migrations: Migrations, **options: str) -> None:
 
 
 def run_command(path: Path, folder: Path, *options: str) -> str:
-    """What it prints."""
-    ended = CliRunner().invoke(cli, ["migrate", str(path), str(folder), *options])
-    assert ended.exit_code == 0, ended.output
-    return ended.output
+    """Run sqlite-utils' migrate command and return its output."""
+    result = CliRunner().invoke(cli, ["migrate", str(path), str(folder), *options])
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 @pytest.fixture(params=SETS)
@@ -62,10 +62,10 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 
 def test_the_command_reaches_the_schema_that_the_service_makes(kind: str, tmp_path: Path) -> None:
-    ours, theirs = tmp_path / "ours.sqlite", tmp_path / "theirs.sqlite"
-    apply(ours, SETS[kind])
-    run_command(theirs, MIGRATIONS / kind)
-    assert schema_of(theirs) == schema_of(ours)
+    applied, migrated = tmp_path / "ours.sqlite", tmp_path / "theirs.sqlite"
+    apply(applied, SETS[kind])
+    run_command(migrated, MIGRATIONS / kind)
+    assert schema_of(migrated) == schema_of(applied)
     tables = {
         "catalog": "domain",
         "map": "posting",
@@ -73,17 +73,17 @@ def test_the_command_reaches_the_schema_that_the_service_makes(kind: str, tmp_pa
         "session": "journal",
         "thumbnail": "thumbnail",
     }
-    assert tables[kind] in schema_of(ours)
-    before = rows_of(theirs)
-    run_command(theirs, MIGRATIONS / kind)  # again changes nothing
-    assert rows_of(theirs) == before
-    listing = run_command(theirs, MIGRATIONS / kind, "--list")
+    assert tables[kind] in schema_of(applied)
+    rows = rows_of(migrated)
+    run_command(migrated, MIGRATIONS / kind)  # again changes nothing
+    assert rows_of(migrated) == rows
+    listing = run_command(migrated, MIGRATIONS / kind, "--list")
     assert SETS[kind].name in listing
     assert "m001" in listing.split("Pending")[0]
 
 
 def test_the_migrations_import_nothing_of_ours(kind: str, tmp_path: Path) -> None:
-    """As a file of its own, with no package of ours in reach."""
+    """Each runs as a file of its own, without any package of this project."""
     code = (
         "import runpy, sys\n"
         "class Refuse:\n"
@@ -96,8 +96,8 @@ def test_the_migrations_import_nothing_of_ours(kind: str, tmp_path: Path) -> Non
 
 
 def test_every_step_has_a_frozen_dump(kind: str) -> None:
-    with Database(memory=True) as nothing:
-        n_steps = len(SETS[kind].pending(nothing))
+    with Database(memory=True) as db:
+        n_steps = len(SETS[kind].pending(db))
     dumps = [path.name for path in FROZEN if path.name.startswith(f"{kind}_v")]
     assert dumps == [f"{kind}_v{step}.sql" for step in range(1, n_steps + 1)], (
         "freeze the new schema: dump a small file of it into tests/migrations/schemas"
@@ -106,10 +106,10 @@ def test_every_step_has_a_frozen_dump(kind: str) -> None:
 
 @pytest.mark.parametrize("dump", FROZEN, ids=lambda path: path.stem)
 def test_a_shipped_step_is_never_edited(dump: Path, tmp_path: Path) -> None:
-    """Today's steps, stopped where the dump was taken, give the very schema of the dump."""
+    """The present steps up to that of the dump make exactly the dump's schema."""
     kind, version = dump.stem.rsplit("_v", 1)
-    with Database(memory=True) as nothing:
-        steps = [step.name for step in SETS[kind].pending(nothing)]
+    with Database(memory=True) as db:
+        steps = [step.name for step in SETS[kind].pending(db)]
     later = steps[int(version) :]
     apply(tmp_path / "now.sqlite", SETS[kind], **({"stop_before": later[0]} if later else {}))
     restore(dump, tmp_path / "then.sqlite")
@@ -127,20 +127,20 @@ def test_a_past_file_reaches_today_and_keeps_its_rows(dump: Path, tmp_path: Path
     kind = dump.stem.rsplit("_v", 1)[0]
     past, new = tmp_path / "past.sqlite", tmp_path / "new.sqlite"
     restore(dump, past)
-    before = rows_of(past)
+    old_rows = rows_of(past)
     if dump.stem.endswith("_v1"):  # by hand, where most steps are missing
         run_command(past, MIGRATIONS / kind)
     else:
         apply(past, SETS[kind])
     apply(new, SETS[kind])
     assert schema_of(past) == schema_of(new)
-    after = rows_of(past)
-    for table, rows in before.items():
+    new_rows = rows_of(past)
+    for table, rows in old_rows.items():
         if table in {"_sqlite_migrations", "clock"}:
             continue
         assert len(rows) >= 1 or table in ("doomed_folder", "map_image_encoding"), f"the dump shows no {table}"
-        assert len(after[table]) == len(rows)
-        for old_row, row in zip(rows, after[table], strict=True):
+        assert len(new_rows[table]) == len(rows)
+        for old_row, row in zip(rows, new_rows[table], strict=True):
             lost = dict(old_row.items() - row.items())
             assert lost.keys() <= ({"image_ids"} if kind == "map" else {"checksum", "owner"})
 

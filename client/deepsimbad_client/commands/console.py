@@ -104,15 +104,15 @@ class Bar(Progress):
     """A progress bar on standard error; off a terminal it stays silent."""
 
     def __init__(
-        self, label: str, total: float | None, *, counted: bool = True, left: ProgressColumn | None = None
+        self, label: str, total: float | None, *, is_counted: bool = True, time_column: ProgressColumn | None = None
     ) -> None:
         super().__init__(
             SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=32),
-            MofNCompleteColumn() if counted else TextColumn("{task.percentage:>3.0f} %"),
+            MofNCompleteColumn() if is_counted else TextColumn("{task.percentage:>3.0f} %"),
             TimeElapsedColumn(),
-            left or TimeRemainingColumn(),
+            time_column or TimeRemainingColumn(),
             TextColumn("{task.fields[note]}", markup=False),
             console=REMARKS,
             disable=not REMARKS.is_interactive,
@@ -141,7 +141,9 @@ class JobBar(Bar):
     """A bar of a job's stages, with the service's own estimate of the time left."""
 
     def __init__(self, label: str) -> None:
-        super().__init__(label, 1.0, counted=False, left=TextColumn("{task.fields[left]}", style="progress.remaining"))
+        super().__init__(
+            label, 1.0, is_counted=False, time_column=TextColumn("{task.fields[left]}", style="progress.remaining")
+        )
 
     def __call__(self, job: Job) -> None:
         """Show how far a job is; one whose service was restarted waits in the queue again."""
@@ -157,7 +159,7 @@ class DownloadBar(Bar):
     """A bar of bytes fetched."""
 
     def __init__(self, label: str) -> None:
-        super().__init__(label, None, counted=False)
+        super().__init__(label, None, is_counted=False)
 
     def __call__(self, n_bytes: int, n_in_all: int | None) -> None:
         """Show how much of a file has come."""

@@ -79,8 +79,8 @@ def demo(folder: Path, frames: int, seed: int) -> None:
             )
         _say(table)
         _show_one(client, drives[LIVE_SEASON])
-        shipped, _ = replays[RELEVANCES[-1]]
-        pictures = draw_passive(shipped, shipped.folder) + _drive_actively(
+        shipped_replay, _ = replays[RELEVANCES[-1]]
+        pictures = draw_passive(shipped_replay, shipped_replay.folder) + _drive_actively(
             client, drives[LIVE_SEASON], folder / "active"
         )
         _say("8. Pictures: " + ", ".join(str(picture) for picture in pictures))
@@ -168,11 +168,13 @@ def _verdict(summary: dict[str, Any]) -> str:
         return "No episode could be scored."
     default, best = PLANNERS[0], min(anr, key=lambda name: anr[name])
     intervals = {name: against["interval_95"] for name, against in summary["against"].items()}
-    clear = [name for name, ends in intervals.items() if ends is not None and not ends[0] <= 0 <= ends[1]]
+    sure_names = [name for name, ends in intervals.items() if ends is not None and not ends[0] <= 0 <= ends[1]]
     winner = f"Lowest ANR: {planner_label(best, summary['planner_named'][best])}, {anr[best]:.2f} %."
     if best == default:
-        return f"{winner} By these {EPISODES} starts that is more than chance over {', '.join(clear) or 'none'}."
-    certainty = "and that is more than chance" if best in clear else f"which {EPISODES} starts cannot tell from chance"
+        return f"{winner} By these {EPISODES} starts that is more than chance over {', '.join(sure_names) or 'none'}."
+    certainty = (
+        "and that is more than chance" if best in sure_names else f"which {EPISODES} starts cannot tell from chance"
+    )
     return f"{winner} The default did not win here, {certainty}."
 
 

@@ -138,8 +138,8 @@ class Observation:
     @property
     def headers(self) -> dict[str, str]:
         """The request headers: the content type, and the landmark model that must match."""
-        matching = {} if self.landmark_model is None else {"If-Match": f'"{self.landmark_model}"'}
-        return {"Content-Type": self.content_type, **matching}
+        match_header = {} if self.landmark_model is None else {"If-Match": f'"{self.landmark_model}"'}
+        return {"Content-Type": self.content_type, **match_header}
 
 
 class ViewForm(TypedDict, total=False):

@@ -185,12 +185,10 @@ class AdminCalls(Face):
             columns |= {"x_m": (x_m, np.float64), "y_m": (y_m, np.float64)}
         if name is not None:
             columns["name"] = ([text_of(text) for text in name], np.str_)
-        packed = BytesIO()
-        np.savez(packed, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
+        body = BytesIO()
+        np.savez(body, **{name: np.asarray(*column) for name, column in columns.items() if column[0] is not None})
         headers = {"Content-Type": "application/octet-stream"}
-        call = Call(
-            "POST", f"{_traverse(domain, traverse)}/frames", _replace_param(replace), headers, packed.getvalue()
-        )
+        call = Call("POST", f"{_traverse(domain, traverse)}/frames", _replace_param(replace), headers, body.getvalue())
         return await self._wire.model(FramesStored, call)
 
     @shared
@@ -297,15 +295,15 @@ class AdminCalls(Face):
         """
         maps = await AdminCalls.maps(self, domain)
         active = next((version.version for version in maps if version.state == "active"), None)
-        earlier = [version for version in maps if version.state == "retired" and version.removed_at is None]
-        if not earlier:
+        earlier_maps = [version for version in maps if version.state == "retired" and version.removed_at is None]
+        if not earlier_maps:
             raise NoEarlierMapError(
                 f"no map of domain {domain} has served before the present one and is still there: "
                 f"list them with `deepsimbad-client maps {domain}`"
             )
         # Times of one form sort as texts; a service that does not tell them has the highest number last.
-        last = max(earlier, key=lambda version: (version.retired_at or "", version.version))
-        rolled_back: MapVersion = await AdminCalls.activate(self, domain, last.version, expected=active)
+        last_map = max(earlier_maps, key=lambda version: (version.retired_at or "", version.version))
+        rolled_back: MapVersion = await AdminCalls.activate(self, domain, last_map.version, expected=active)
         return rolled_back
 
     @shared

@@ -71,7 +71,7 @@ class SessionCalls(Face):
         self.opened = state
         self.keep = keep
         self._path = session_path(state.session_id)
-        self._deleted = False
+        self._is_deleted = False
 
     @property
     def session_id(self) -> str:
@@ -195,10 +195,10 @@ class SessionCalls(Face):
     async def delete(self) -> None:
         """End the session; nothing more can be asked of it."""
         await self._wire.send(Call.delete(self._path))
-        self._deleted = True
+        self._is_deleted = True
 
     async def _leave(self, error: BaseException | None, /) -> None:
-        if self.keep or self._deleted:
+        if self.keep or self._is_deleted:
             return
         try:
             await SessionCalls.delete(self)

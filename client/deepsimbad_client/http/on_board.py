@@ -103,10 +103,10 @@ class OnBoardEncoder:
 
         Raises MissingExtraError, OtherWeightsError, InvalidLandmarkModelError.
         """
-        _ = self._loaded
+        _ = self._loaded_evaluator
 
     @cached_property
-    def _loaded(self) -> Evaluator:
+    def _loaded_evaluator(self) -> Evaluator:
         """The evaluator with its extractor, whose weights are the map's."""
         with _named_errors("the map's extractor cannot be loaded here"):
             self._evaluator.load()
@@ -135,7 +135,7 @@ class OnBoardEncoder:
         """
         if not is_composed(self.landmarks.model):
             return self.ranks(image, encoding=encoding)
-        encodings = self._encoded(image, encoding)
+        encodings = self._encoding_of(image, encoding)
         if encodings is None:
             return self._blank_view()
         with _named_arguments():
@@ -152,7 +152,7 @@ class OnBoardEncoder:
         n_sent = ranked_landmarks_within(RANKS_BYTES, self.n_landmarks) if m is None else m
         if not 1 <= n_sent <= self.n_landmarks:
             raise InvalidArgumentError(f"m is {n_sent}: send 1 to {self.n_landmarks} landmarks")
-        encodings = self._encoded(image, encoding)
+        encodings = self._encoding_of(image, encoding)
         if encodings is None:
             return self._blank_view()
         with _named_arguments():
@@ -164,7 +164,7 @@ class OnBoardEncoder:
     def _blank_view(self) -> Observation:
         return replace(observation(dissimilarities=[0] * self.n_landmarks), landmark_model=self.digest)
 
-    def _encoded(
+    def _encoding_of(
         self, image: "Image | NDArray[np.uint8] | None", encoding: Numbers | None
     ) -> NDArray[np.float32] | None:
         """The encoding of the view, [1, d]; None for an image that shows nothing."""
@@ -185,7 +185,7 @@ class OnBoardEncoder:
                 pixels = decode_image(image_bytes(image), _MAX_PIXELS, levels=levels)
             except DeepSimbadError as error:
                 raise BrokenFrameError(f"{source}: {error.message}") from error
-        evaluator = self._loaded
+        evaluator = self._loaded_evaluator
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
             raise InvalidArgumentError(f"{source} is {list(pixels.shape)} {pixels.dtype}, not [height, width, 3] uint8")
         with _named_errors("the image cannot be encoded"):

@@ -75,7 +75,7 @@ def upload(
     if not recording.frames:
         raise SourceError(f"{recording.name} has no frames to send")
     left_out = LeftOut(recording, allow_missing=allow_missing)
-    started = time.monotonic()
+    start_s = time.monotonic()
     domain_answer = client.domain(domain)
     recording, input_size = as_taken(recording, domain_answer.takes), domain_answer.input_size
     stored_traverse = client.admin.create_traverse(domain, traverse, grey_levels=recording.grey_levels)
@@ -87,13 +87,13 @@ def upload(
             on_progress(report)
 
     tell()
-    stored = client.admin.frames(domain, traverse)
-    comparison = Comparison(recording, stored)
+    stored_columns = client.admin.frames(domain, traverse)
+    comparison = Comparison(recording, stored_columns)
     for _ in comparison.read_digests(input_size, concurrency):
         report.n_skipped += 1
         tell()
     replaced_rows = comparison.rows_to_replace(f"{domain}/{traverse}", replace=replace)
-    _check_unsent(recording, stored, f"{domain}/{traverse}", input_size)
+    _check_unsent(recording, stored_columns, f"{domain}/{traverse}", input_size)
     equal_rows = set(comparison.rows) - replaced_rows
     rows = [row for row in range(len(recording.frames)) if row not in equal_rows]
     report.n_skipped = len(equal_rows)
@@ -120,7 +120,7 @@ def upload(
                 left_out.add(outcome, frame.name)
             tell()
     report.warnings = client.admin.traverse(domain, traverse).warnings
-    report.seconds = time.monotonic() - started
+    report.seconds = time.monotonic() - start_s
     if report.n_sent + report.n_skipped == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in report.n_broken.items())
         raise SourceError(f"none of the {report.n_frames} frames of {recording.name} could be sent: {reasons}")
@@ -130,14 +130,14 @@ def upload(
 class Comparison:
     """A recording compared with the frames that its traverse holds, `stored` as from `Admin.frames`."""
 
-    def __init__(self, recording: Recording, stored: Mapping[str, NDArray[Any]]) -> None:
-        row_of = {index: row for row, index in enumerate(stored["index"].tolist())}
+    def __init__(self, recording: Recording, stored_columns: Mapping[str, NDArray[Any]]) -> None:
+        row_of = {index: row for row, index in enumerate(stored_columns["index"].tolist())}
         self.rows = [row for row, frame in enumerate(recording.frames) if frame.index in row_of]  # that are stored
         self._n_unsent = len(row_of) - len(self.rows)
         self._recording = recording
         frames = [recording.frames[row] for row in self.rows]
         stored_rows = [row_of[frame.index] for frame in frames]
-        self._stored = {name: stored[name][stored_rows] for name in IDENTITY}
+        self._stored = {name: stored_columns[name][stored_rows] for name in IDENTITY}
         self._columns = {**columns_of(frames), "content_digest": np.full(len(frames), UNKNOWN_CONTENT, np.uint64)}
 
     def read_digests(
@@ -193,28 +193,28 @@ class Comparison:
 
 
 def _check_unsent(
-    recording: Recording, stored: Mapping[str, NDArray[Any]], traverse: str, input_size: tuple[int, int] | None
+    recording: Recording, stored_columns: Mapping[str, NDArray[Any]], traverse: str, input_size: tuple[int, int] | None
 ) -> None:
     """Check that stored frames which a slice leaves unsent are those of its full recording; raises OtherFramesError.
 
     They must be equal by place and time, a few also by content.
     """
     full, sent_indices = recording.full_recording or recording, {frame.index for frame in recording.frames}
-    unsent_rows = [row for row, index in enumerate(stored["index"].tolist()) if index not in sent_indices]
+    unsent_rows = [row for row, index in enumerate(stored_columns["index"].tolist()) if index not in sent_indices]
     if not unsent_rows:
         return
-    unsent_columns = {name: stored[name][unsent_rows] for name in ("index", *IDENTITY)}
+    unsent_columns = {name: stored_columns[name][unsent_rows] for name in ("index", *IDENTITY)}
     indices = set(unsent_columns["index"].tolist())
-    rest = [row for row, frame in enumerate(full.frames) if frame.index in indices]
-    if not rest and len(unsent_rows) < len(stored["index"]):
+    rest_rows = [row for row, frame in enumerate(full.frames) if frame.index in indices]
+    if not rest_rows and len(unsent_rows) < len(stored_columns["index"]):
         return  # the stored frames go on behind the recording's end, and the common ones are compared already
-    if rest:
-        frames = [full.frames[row] for row in rest]
-        encodings = None if full.encodings is None else full.encodings[rest]
+    if rest_rows:
+        frames = [full.frames[row] for row in rest_rows]
+        encodings = None if full.encodings is None else full.encodings[rest_rows]
         comparison = Comparison(
             dataclasses.replace(full, frames=frames, encodings=encodings, full_recording=None), unsent_columns
         )
-        for _ in comparison.read_digests(input_size, 1, spread(len(rest))):
+        for _ in comparison.read_digests(input_size, 1, spread(len(rest_rows))):
             pass
         if not comparison.difference_masks():
             return

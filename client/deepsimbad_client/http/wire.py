@@ -62,10 +62,10 @@ def http_settings(url: str | None, api_key: str | None, timeout: httpx2.Timeout)
     """
     url = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
     try:
-        parsed = httpx2.URL(url)
+        parsed_url = httpx2.URL(url)
     except httpx2.InvalidURL as error:
         raise InvalidArgumentError(f"{url!r} is no address: {error}") from error
-    if parsed.scheme not in {"http", "https"} or not parsed.host:
+    if parsed_url.scheme not in {"http", "https"} or not parsed_url.host:
         raise InvalidArgumentError(f"{url!r} is no address: give something like {DEFAULT_URL}")
     headers = {"User-Agent": "deepsimbad-client", "Accept": "application/json"}
     if key := os.environ.get(KEY_VARIABLE) if api_key is None else api_key:
@@ -73,11 +73,11 @@ def http_settings(url: str | None, api_key: str | None, timeout: httpx2.Timeout)
             raise InvalidArgumentError("the API key holds characters that no header can carry")
         headers["Authorization"] = f"Bearer {key}"
     settings = {"base_url": url, "headers": headers, "timeout": timeout, "limits": _CONNECTIONS}
-    if not _is_loopback(parsed.host):
+    if not _is_loopback(parsed_url.host):
         return settings
     # A proxy of the environment does not lead to this machine. Plain http needs no certificates, and to read those of
     # all authorities takes 24 ms.
-    return settings | {"mounts": {f"all://{parsed.netloc.decode()}": None}, "verify": parsed.scheme == "https"}
+    return settings | {"mounts": {f"all://{parsed_url.netloc.decode()}": None}, "verify": parsed_url.scheme == "https"}
 
 
 def _is_loopback(host: str) -> bool:
@@ -89,11 +89,11 @@ def _is_loopback(host: str) -> bool:
 
 def _by_proxy(url: str) -> str:
     """Words for the proxy of the environment that requests go through; "" where there is none."""
-    parsed = httpx2.URL(url)
-    if _is_loopback(parsed.host) or proxy_bypass(parsed.host):
+    parsed_url = httpx2.URL(url)
+    if _is_loopback(parsed_url.host) or proxy_bypass(parsed_url.host):
         return ""
     proxies = getproxies()
-    proxy = proxies.get(parsed.scheme) or proxies.get("all")
+    proxy = proxies.get(parsed_url.scheme) or proxies.get("all")
     return f" by the proxy {httpx2.URL(proxy).copy_with(userinfo=b'')} of the environment" if proxy else ""
 
 
@@ -125,16 +125,16 @@ class Attempts:
     def after_failure(self, error: httpx2.TransportError) -> float:
         """Seconds to wait before the next try; raises TransportError when there is none."""
         self.n_sent += 1
-        untouched = isinstance(error, UNTOUCHED_FAILURES)
-        safe = self.repeat is Repeat.ALWAYS or (self.repeat is Repeat.IF_UNTOUCHED and untouched)
-        hopeless = isinstance(error, httpx2.UnsupportedProtocol | httpx2.LocalProtocolError)
+        is_untouched = isinstance(error, UNTOUCHED_FAILURES)
+        is_safe = self.repeat is Repeat.ALWAYS or (self.repeat is Repeat.IF_UNTOUCHED and is_untouched)
+        is_hopeless = isinstance(error, httpx2.UnsupportedProtocol | httpx2.LocalProtocolError)
         reason = str(error) or type(error).__name__
-        if safe and not hopeless and self.n_sent < self.policy.attempts:
-            self.answer_lost |= not untouched
+        if is_safe and not is_hopeless and self.n_sent < self.policy.attempts:
+            self.answer_lost |= not is_untouched
             return self._announce(self.policy.backoff_s(self.n_sent, self.jitter()), reason)
         kind = TransportTimeoutError if isinstance(error, httpx2.TimeoutException) else TransportError
         tries = f"{self.n_sent} tries" if self.n_sent > 1 else "one try"
-        advice = "; is the service running there?" if untouched else ""
+        advice = "; is the service running there?" if is_untouched else ""
         raise kind(f"no answer to {self.request_text} after {tries}: {reason}{advice}") from error
 
     def after_answer(self, response: httpx2.Response) -> float | None:
@@ -153,8 +153,8 @@ class Attempts:
 
     def _announce(self, wait_s: float, reason: str) -> float:
         """Log the wait, since a client that only waits looks dead, and return it."""
-        coming = f"try {self.n_sent + 1} of {self.policy.attempts}"
-        logger.info("%s: %s; trying again in %.1f s (%s)", self.request_text, reason, wait_s, coming)
+        next_try = f"try {self.n_sent + 1} of {self.policy.attempts}"
+        logger.info("%s: %s; trying again in %.1f s (%s)", self.request_text, reason, wait_s, next_try)
         return wait_s
 
 

@@ -34,8 +34,8 @@ class AnnotatedRecording(Recording):
 
     def stamp(self, frame: Frame) -> str:
         """See `Recording.stamp`."""
-        text = json.dumps([by_name.get(frame.name) for by_name in self.annotations.values()])
-        return f"{self.image_recording.stamp(frame) if self.with_image else frame.name} {text}"
+        annotation_text = json.dumps([by_name.get(frame.name) for by_name in self.annotations.values()])
+        return f"{self.image_recording.stamp(frame) if self.with_image else frame.name} {annotation_text}"
 
     def shown_by(self, levels: GreyLevels | None) -> "AnnotatedRecording":
         """See `Recording.shown_by`."""

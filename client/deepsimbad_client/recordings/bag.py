@@ -151,12 +151,12 @@ def read_bag(
         image_topic = _choose_topic(
             image_topic, [name for name, kind in types.items() if kind in _IMAGES], "images", path
         )
-        placing = sorted(
+        position_topics = sorted(
             (name for name in types if types[name] in _POSITIONS), key=lambda name: _POSITIONS.index(types[name])
         )
-        if position_topic or placing:
-            position_topic = _choose_topic(position_topic, placing, "positions", path, take_first=True)
-            choice = f" (there are {', '.join(placing)})" if len(placing) > 1 else ""
+        if position_topic or position_topics:
+            position_topic = _choose_topic(position_topic, position_topics, "positions", path, take_first=True)
+            choice = f" (there are {', '.join(position_topics)})" if len(position_topics) > 1 else ""
             remarks.append(f"images of {image_topic}, positions of {position_topic}{choice}")
         else:
             remarks.append(f"images of {image_topic}, {spacing_m:g} m apart: there are no poses, fixes or odometry")
@@ -214,8 +214,8 @@ class _Content:
         row = int(np.argmin(steps_us))
         if steps_us[row] > -MOST_LATE_US:
             return []
-        back = f"{self.images[row][0]} says {-steps_us[row] / 1e6:.1f} s before the image recorded before it"
-        return [f"{back}: images are taken in the order of their headers' times. Was a clock set on the way?"]
+        step_text = f"{self.images[row][0]} says {-steps_us[row] / 1e6:.1f} s before the image recorded before it"
+        return [f"{step_text}: images are taken in the order of their headers' times. Was a clock set on the way?"]
 
     def take(self, reader: "AnyReader", topic: str, kind: str, received_ns: int, raw: bytes, name: str) -> None:
         """Add one message."""

@@ -123,8 +123,8 @@ def _by_numbers(folder: Path, spacing_m: float) -> Recording | None:
 def _folder_recording(folder: Path, frames: Sequence[Frame], left_out: dict[str, list[str]]) -> FolderRecording | None:
     if not frames:
         return None
-    lost = {reason: names for reason, names in left_out.items() if names}
-    return FolderRecording(folder.resolve().name, tuple(frames), lost, folder=folder)
+    left_out_names = {reason: names for reason, names in left_out.items() if names}
+    return FolderRecording(folder.resolve().name, tuple(frames), left_out_names, folder=folder)
 
 
 def _summed_up(

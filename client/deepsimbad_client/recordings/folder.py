@@ -118,7 +118,7 @@ def read_folder(
         )
         placement.remarks.append(
             f"{len(names)} images are taken {spacing_m:g} m apart: there is no {POSITIONS_FILE} and no track (.gpx, "
-            f".nmea) beside them, and no EXIF among them says a place{_misnamed(paths)}"
+            f".nmea) beside them, and no EXIF among them says a place{_unread_tables_text(paths)}"
         )
     if inner := _inner(folder):
         placement.remarks.append(
@@ -136,7 +136,7 @@ def read_folder(
     return _prepare(recording, rotate)
 
 
-def _misnamed(paths: Sequence[Path]) -> str:
+def _unread_tables_text(paths: Sequence[Path]) -> str:
     """Words for files that may hold positions and are not read; "" where there are none."""
     names = sorted(path.name for path in paths if _TABLE.fullmatch(path.name.lower()) and path.name != CAPTIONS)
     return (

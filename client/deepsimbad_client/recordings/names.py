@@ -39,13 +39,13 @@ def in_order(names: Sequence[str]) -> list[str]:
     if len(set(map(len, stems))) == 1 and all(map(_HEXADECIMAL.fullmatch, stems)) and not "".join(stems).isdigit():
         return sorted(names, key=lambda name: (name.lower(), name))
     fractions = [
-        part.partition(".")[2] for name in names for part in _DECIMALS.split(_pointed(name))[1::2] if "." in part
+        part.partition(".")[2] for name in names for part in _DECIMALS.split(_with_points(name))[1::2] if "." in part
     ]
     counters = len(set(map(len, fractions))) > 1 and any(re.fullmatch(r"[0-9]+0", fraction) for fraction in fractions)
     numbers = _DIGITS if counters else _DECIMALS
 
     def key(name: str) -> tuple[list[tuple[Decimal, str]], str]:
-        parts = numbers.split(_pointed(name))
+        parts = numbers.split(_with_points(name))
         return [(Decimal(part), "") if place % 2 else (_WORD, part) for place, part in enumerate(parts)], name
 
     return sorted(names, key=key)
@@ -60,13 +60,13 @@ def stem(name: str) -> str:
     return base if base and not ending.isdigit() else name
 
 
-def _pointed(name: str) -> str:
+def _with_points(name: str) -> str:
     """A name's stem, with points for decimal commas, and seconds and nanoseconds as one number."""
     return _STAMP.sub(r"\1.\2", _DECIMAL_COMMA.sub(".", stem(name)))
 
 
 def _number(name: str) -> Decimal | None:
-    return Decimal(_pointed(name)) if _NUMBER.fullmatch(_pointed(name)) else None
+    return Decimal(_with_points(name)) if _NUMBER.fullmatch(_with_points(name)) else None
 
 
 def unit_of(time: Decimal) -> str | None:
@@ -84,8 +84,8 @@ def times_us(cells: Sequence[str], unit: str | None, locations: Sequence[str]) -
     timed_cells = [(number, location) for number, location in zip(numbers, locations, strict=True) if number]
     units = {unit_of(number): location for number, location in timed_cells}
     if len(units) > 1:
-        mixed = "; ".join(f"{location} is in {unit_ or 'none'}" for unit_, location in units.items())
-        raise SourceError(f"times of several units: {mixed}; write all of them in microseconds (timestamp_us)")
+        units_text = "; ".join(f"{location} is in {unit_ or 'none'}" for unit_, location in units.items())
+        raise SourceError(f"times of several units: {units_text}; write all of them in microseconds (timestamp_us)")
     unit = next(iter(units), None) or unit
     if unit is None and timed_cells:
         raise SourceError(
@@ -120,7 +120,7 @@ def _time(cell: str, location: str) -> Decimal | None:
 
 def times_of(names: Sequence[str]) -> list[int] | None:
     """Unix microseconds of the names, if all end in a time since 1970 of one unit (s, ms, us or ns); else None."""
-    tokens = [_DECIMALS.split(_pointed(name))[1::2] for name in names]
+    tokens = [_DECIMALS.split(_with_points(name))[1::2] for name in names]
     numbers = [Decimal(parts[-1]) for parts in tokens if parts]
     units = {unit_of(number) for number in numbers}
     unit = units.pop() if len(units) == 1 and len(numbers) == len(names) else None
@@ -142,7 +142,7 @@ def counted_anew(names: Sequence[str]) -> list[int]:
 
     Empty where that number is a clock's, or the last digits of one number, or the names say that they are parts.
     """
-    parts = [_DECIMALS.split(_pointed(name)) for name in names]
+    parts = [_DECIMALS.split(_with_points(name)) for name in names]
     if any(len(part) < 4 for part in parts):
         return []
     numbers = [Decimal(part[-2]) for part in parts]
@@ -170,15 +170,15 @@ class Finder:
         return next((files[key(file_name)] for key, files in self._tables if key(file_name) in files), None)
 
 
-def _folded(name: str) -> str:
+def _fold(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
 _KEYS: tuple[Callable[[str], Hashable], ...] = (
     lambda name: name,
-    _folded,
+    _fold,
     stem,
-    lambda name: stem(_folded(name)),
+    lambda name: stem(_fold(name)),
     _number,
 )
 

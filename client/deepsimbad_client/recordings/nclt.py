@@ -97,7 +97,7 @@ class NcltRecording(Recording):
 
     def upright(self, frame: Frame) -> Image:
         """Read a frame, undistorted where asked, turned upright; raises BrokenFrameError."""
-        stored = self._stored(frame.name)
+        stored = self._stored_image(frame.name)
         size, expected = (stored.shape[1], stored.shape[0]), self.stored_size
         if size != expected:
             raise BrokenFrameError(
@@ -118,7 +118,7 @@ class NcltRecording(Recording):
         sizes: Counter[tuple[int, int]] = Counter()
         for name in self.probes:
             try:
-                image = self._stored(name)
+                image = self._stored_image(name)
             except BrokenFrameError:
                 continue
             sizes[image.shape[1], image.shape[0]] += 1
@@ -126,7 +126,7 @@ class NcltRecording(Recording):
         commonest = [size for size, n in sizes.items() if n == n_most]
         return commonest[0] if commonest and NCLT_STORED_SIZE not in commonest else NCLT_STORED_SIZE
 
-    def _stored(self, name: str) -> Image:
+    def _stored_image(self, name: str) -> Image:
         path = self.folder / name
         return decode(read_file(path), path, as_stored=True)
 
@@ -167,8 +167,8 @@ def read_nclt(
         places = [parent / date / "lb3" / f"Cam{camera}" for parent in (root, root / "images")]
         for parent in (root, root / "images"):
             places += sorted((parent / date).glob(f"lb3*/Cam{camera}*"))
-        folder = _first(f"images of NCLT {date}", places, Path.is_dir, drives_in(root / date, root))
-    truth = read_ground_truth(_first(f"ground truth of NCLT {date}", ground_truth_files(root, date), Path.is_file))
+        folder = _first_path(f"images of NCLT {date}", places, Path.is_dir, drives_in(root / date, root))
+    truth = read_ground_truth(_first_path(f"ground truth of NCLT {date}", ground_truth_files(root, date), Path.is_file))
     names, not_times = _images_by_time(folder)
     if not names:
         raise SourceError(f"{folder} holds no image named <utime>.tiff (nor .jpg, .png or another format)")
@@ -177,7 +177,7 @@ def read_nclt(
     )
     left_out = {
         **placement.left_out_names,
-        f"missing in Cam{camera}": _missing(folder, names),
+        f"missing in Cam{camera}": _missing_names(folder, names),
         "file name is not a time": not_times,
     }
     probe_rows = np.unique(np.linspace(0, len(placement.frames) - 1, N_SIZE_PROBES).round().astype(int))
@@ -204,11 +204,11 @@ def ground_truth_files(root: Path, date: str) -> list[Path]:
     ]
 
 
-def _first(description: str, places: Sequence[Path], is_there: Callable[[Path], bool], near: str = "") -> Path:
+def _first_path(description: str, places: Sequence[Path], is_there: Callable[[Path], bool], hint: str = "") -> Path:
     for place in places:
         if is_there(place):
             return place
-    raise SourceError(f"no {description}: looked for {', '.join(map(str, places))}{near}")
+    raise SourceError(f"no {description}: looked for {', '.join(map(str, places))}{hint}")
 
 
 def drives_in(*roots: Path) -> str:
@@ -223,12 +223,14 @@ def _images_by_time(folder: Path) -> tuple[dict[int, str], list[str]]:
         paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "."]
     except OSError as error:
         raise SourceError(f"cannot read the folder {folder}: {error.strerror or error}") from error
-    timed = [path for path in paths if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18]
-    timed.sort(key=lambda path: path.suffix.lower() in TIFF_SUFFIXES)
-    return {int(path.stem): path.name for path in timed}, sorted(path.name for path in set(paths) - set(timed))
+    timed_paths = [path for path in paths if path.stem.isascii() and path.stem.isdigit() and len(path.stem) <= 18]
+    timed_paths.sort(key=lambda path: path.suffix.lower() in TIFF_SUFFIXES)
+    return {int(path.stem): path.name for path in timed_paths}, sorted(
+        path.name for path in set(paths) - set(timed_paths)
+    )
 
 
-def _missing(folder: Path, names: Mapping[int, str]) -> list[str]:
+def _missing_names(folder: Path, names: Mapping[int, str]) -> list[str]:
     """Files of the other cameras' images at times of which this camera's `folder` has none."""
     other_names: dict[int, str] = {}
     for camera_folder in folder.parent.glob("Cam[0-9]"):
@@ -302,9 +304,9 @@ def _rows(path: Path) -> Reals:
 
 
 def _row(line: str) -> list[float]:
-    broken = [float("nan")] * N_COLUMNS
+    nan_row = [float("nan")] * N_COLUMNS
     try:
         values = [float(cell) for cell in line.split(",")[:N_COLUMNS]]
     except ValueError:
-        return broken
-    return values if len(values) == N_COLUMNS else broken
+        return nan_row
+    return values if len(values) == N_COLUMNS else nan_row

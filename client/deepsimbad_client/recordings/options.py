@@ -76,10 +76,10 @@ def reading(command: Command) -> Command:
 
 def accounting(command: Command) -> Command:
     """Add the options of commands that use a whole recording, about frames that cannot be used."""
-    missing = click.option(
+    missing_option = click.option(
         "--allow-missing", is_flag=True, help=f"Go on where more than {MOST_LEFT_OUT:.0%} of the frames are left out."
     )
-    return missing(click.option("--verbose", is_flag=True, help="Name every frame that is left out.")(command))
+    return missing_option(click.option("--verbose", is_flag=True, help="Name every frame that is left out.")(command))
 
 
 def open_recording(source: str, allow_missing: bool = True, *, closed: bool = False, **reading: Any) -> Recording:

@@ -42,10 +42,10 @@ class Placement:
 
     def leave_out(self, usable: Sequence[bool], reason: str) -> None:
         """Keep the usable frames, and leave out the others for `reason`."""
-        lost = [frame.name for frame, good in zip(self.frames, usable, strict=True) if not good]
-        if lost:
-            self.left_out_names[reason] = lost
-        self.frames = [frame for frame, good in zip(self.frames, usable, strict=True) if good]
+        lost_names = [frame.name for frame, is_usable in zip(self.frames, usable, strict=True) if not is_usable]
+        if lost_names:
+            self.left_out_names[reason] = lost_names
+        self.frames = [frame for frame, is_usable in zip(self.frames, usable, strict=True) if is_usable]
 
     def follow(self, later: "Placement") -> None:
         """Take over the frames of a later step, and add its left-out names and remarks."""
@@ -105,8 +105,8 @@ def place_on_track(
     """
     remarks, given_us = [], np.array([time for _, time in images], np.int64)
     if (np.diff(given_us) < 0).any():
-        back = _step_back([Frame(0, name, UNPLACED) for name, _ in images], given_us)
-        remarks.append(f"{back}: they are taken in the order of their times. Was a clock set on the way?")
+        step_text = _step_back([Frame(0, name, UNPLACED) for name, _ in images], given_us)
+        remarks.append(f"{step_text}: they are taken in the order of their times. Was a clock set on the way?")
     images = sorted(images, key=lambda image: image[1])
     if together and images[-1][1] < FIRST_US <= track.time_us[0]:
         images = [(name, time + int(track.time_us[0])) for name, time in images]
@@ -207,12 +207,12 @@ def _leap(frames: Sequence[Frame], order: NDArray[np.intp], is_stated: bool) -> 
     """In words, how frames leap from place to place in `order` but not in their own order; None: they do not."""
     places = [(frame.position_m, 0.0) if is_stated else (frame.x_m, frame.y_m) for frame in frames]
     x_m, y_m = np.array(places, np.float64).T
-    usable = on_track(x_m, y_m, None, STATED_SPEEDS if is_stated else SPIKE_SPEEDS)
-    if usable.mean() < 1 - MOST_LEFT_OUT:
+    is_usable = on_track(x_m, y_m, None, STATED_SPEEDS if is_stated else SPIKE_SPEEDS)
+    if is_usable.mean() < 1 - MOST_LEFT_OUT:
         return None
     own_m, other_m = (
         float(np.hypot(np.diff(x_m[rows]), np.diff(y_m[rows])).max())
-        for rows in (np.flatnonzero(usable), order[usable[order]])
+        for rows in (np.flatnonzero(is_usable), order[is_usable[order]])
     )
     if other_m <= LEAPS * own_m:
         return None
@@ -252,9 +252,9 @@ def _use_stated(placement: Placement, time_us: Times | None, source: str) -> Non
     usable = on_track(position_m, np.zeros_like(position_m), time_us, STATED_SPEEDS)
     _without_spikes(placement, usable, position_m, np.zeros_like(position_m))
     position_m = position_m[usable]
-    risen, rises = rising_m(position_m)
-    fallen, falls = rising_m(-position_m)
-    turned_m, usable = (-fallen, falls) if falls.sum() > rises.sum() else (risen, rises)
+    risen_m, rises = rising_m(position_m)
+    fallen_m, falls = rising_m(-position_m)
+    turned_m, usable = (-fallen_m, falls) if falls.sum() > rises.sum() else (risen_m, rises)
     n_back = int((~usable).sum())
     if n_back > MOST_LEFT_OUT * len(usable):
         names = [frame.name for frame in placement.frames]

@@ -151,13 +151,13 @@ def read_positions(path: Path, names: Sequence[str], name_times_us: Sequence[int
         )
         for name, time_us in image_times
     ]
-    lost = {
+    left_out_names = {
         f"not in {path.name}": [name for name in names if name not in row_of],
         f"in {path.name}{NO_IMAGE}": without_image,
     }
     return Placement(
         frames,
-        {reason: image_names for reason, image_names in lost.items() if image_names},
+        {reason: image_names for reason, image_names in left_out_names.items() if image_names},
         remarks + _clock_remarks(image_times, frames),
         deadband_m,
     )

@@ -223,11 +223,11 @@ def _read_encodings(path: Path, spacing_m: float) -> Recording:
         raise SourceError(f"{path}: encodings are real numbers, not {raw.dtype}")
     with np.errstate(over="ignore"):  # what does not fit float32 becomes infinite and is named below
         encodings = np.ascontiguousarray(raw, dtype=np.float32)
-    broken = np.flatnonzero(~np.isfinite(encodings).all(axis=1))
-    if len(broken):
+    broken_rows = np.flatnonzero(~np.isfinite(encodings).all(axis=1))
+    if len(broken_rows):
         raise SourceError(
-            f"{path}: {len(broken)} rows hold NaN, infinity or values beyond float32, the first is row {broken[0]} "
-            "(from 0)"
+            f"{path}: {len(broken_rows)} rows hold NaN, infinity or values beyond float32, the first is row "
+            f"{broken_rows[0]} (from 0)"
         )
     frames = tuple(Frame(row, f"{path.stem}[{row}]", row * spacing_m) for row in range(len(encodings)))
     return Recording(path.stem, frames, encodings=encodings)
@@ -252,14 +252,14 @@ def _read_csv(path: Path) -> NDArray[np.generic]:
         lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
     except UnicodeDecodeError as error:
         raise SourceError(f"{path} is not text: {error}") from error
-    filled = [(number, line) for number, line in lines if line.strip()]
-    for number, line in filled:
+    filled_lines = [(number, line) for number, line in lines if line.strip()]
+    for number, line in filled_lines:
         separator = next((mark for mark in ";\t," if mark in line), None)  # None: blanks
         cells = line.split(separator) if separator == "," else line.replace(",", ".").split(separator)
         try:
             row = np.array(cells, dtype=np.float64)
         except ValueError as error:
-            if number == filled[0][0] and all(finite_number(cell) is None for cell in cells):
+            if number == filled_lines[0][0] and all(finite_number(cell) is None for cell in cells):
                 continue  # a header
             raise SourceError(f"{path}, line {number}: {error}") from error
         if rows and len(row) != len(rows[0]):
@@ -313,10 +313,10 @@ def one_turn(recording: Recording) -> Recording:
     left_row = int(np.argmax(away_m > 3 * near_m))
     ahead_x, ahead_y = x_m[left_row] - x_m[0], y_m[left_row] - y_m[0]
     onwards = np.gradient(x_m) * ahead_x + np.gradient(y_m) * ahead_y >= 0
-    back = np.flatnonzero((np.arange(len(x_m)) > left_row) & (away_m <= near_m) & onwards)
-    if not left_row or not len(back):
+    return_rows = np.flatnonzero((np.arange(len(x_m)) > left_row) & (away_m <= near_m) & onwards)
+    if not left_row or not len(return_rows):
         return recording
-    visit = back[: int(np.argmax(np.diff(back, append=len(x_m) + 2) > 1)) + 1]
+    visit = return_rows[: int(np.argmax(np.diff(return_rows, append=len(x_m) + 2) > 1)) + 1]
     end = int(visit[np.argmin(away_m[visit])]) + 1
     if end == len(recording.frames):
         return recording

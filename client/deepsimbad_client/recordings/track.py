@@ -67,17 +67,17 @@ class Track:
         elapsed_us = np.clip(time_us - self.time_us[left], 0, step_us)
         share = elapsed_us / np.maximum(step_us, 1)
 
-        def between(values: Reals) -> Reals:
+        def interpolated(values: Reals) -> Reals:
             return np.asarray(values[left] + share * (values[right] - values[left]), dtype=np.float64)
 
         turn = wrapped_rad(self.heading_rad[right] - self.heading_rad[left])
         return Poses(
             covered=covered,
             in_gap=covered & (elapsed_us > 0) & (step_us > self.max_gap_s * 1e6),
-            x_m=between(self.x_m),
-            y_m=between(self.y_m),
+            x_m=interpolated(self.x_m),
+            y_m=interpolated(self.y_m),
             heading_rad=wrapped_rad(self.heading_rad[left] + share * turn),
-            position_m=between(self.position_m),
+            position_m=interpolated(self.position_m),
         )
 
 
@@ -232,18 +232,18 @@ def walked_m(x_m: Reals, y_m: Reals, deadband_m: float) -> Reals:
     It is the sum of the distances up to the last anchor plus the greatest distance from it so far; a pose at least
     `deadband_m` away becomes the next anchor.
     """
-    travelled = np.zeros(len(x_m), dtype=np.float64)
+    travelled_m = np.zeros(len(x_m), dtype=np.float64)
     xs, ys = x_m.tolist(), y_m.tolist()
     anchor_x, anchor_y = xs[0], ys[0]
     up_to_anchor = farthest = 0.0
     for i, (x, y) in enumerate(zip(xs, ys, strict=True)):
         away = hypot(x - anchor_x, y - anchor_y)
         farthest = max(farthest, away)
-        travelled[i] = up_to_anchor + farthest
+        travelled_m[i] = up_to_anchor + farthest
         if away >= deadband_m:
             up_to_anchor += away
             anchor_x, anchor_y, farthest = x, y, 0.0
-    return travelled
+    return travelled_m
 
 
 def back_tolerance_m(position_m: Reals) -> float:
@@ -263,9 +263,9 @@ def rising_m(position_m: Reals) -> tuple[Reals, NDArray[np.bool_]]:
     lower_m = position_m[rising_rows][np.maximum(np.searchsorted(rising_rows, rows, side="right") - 1, 0)]
     upper_m = position_m[rising_rows][np.minimum(np.searchsorted(rising_rows, rows), len(rising_rows) - 1)]
     usable = (position_m >= lower_m - tolerance) & (position_m <= upper_m + tolerance)
-    risen = position_m.copy()
-    risen[usable] = np.maximum.accumulate(position_m[usable])
-    return risen, usable
+    risen_m = position_m.copy()
+    risen_m[usable] = np.maximum.accumulate(position_m[usable])
+    return risen_m, usable
 
 
 def longest_rising(values: Sequence[float]) -> NDArray[np.intp]:
@@ -303,5 +303,5 @@ def _window(time_us: Times) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 def _average(values: Reals, low: NDArray[np.intp], high: NDArray[np.intp]) -> Reals:
     """The mean of each pose's window."""
     centre = values.mean()  # keeps the running sum small, hence exact
-    running = np.concatenate(([0.0], np.cumsum(values - centre)))
-    return np.asarray(centre + (running[high] - running[low]) / (high - low), dtype=np.float64)
+    sums = np.concatenate(([0.0], np.cumsum(values - centre)))
+    return np.asarray(centre + (sums[high] - sums[low]) / (high - low), dtype=np.float64)

@@ -177,13 +177,13 @@ class Stage:
         rng = np.random.default_rng([seed, episode])
         return int(rng.integers(first, stop)), int(rng.integers(2**31))
 
-    def nearest(self, here_m: float, commanded_m: float, broken: frozenset[int]) -> int:
+    def nearest(self, here_m: float, commanded_m: float, broken_rows: frozenset[int]) -> int:
         """The row of the frame, not `broken`, nearest to where a move leads; raises ReplayError where all are broken.
 
         Frames ahead in the move's direction come first: a robot told to move does move, though the next frame may be
         farther than it was told, and does not look at the same picture twice.
         """
-        usable = np.delete(np.arange(len(self.position_m)), sorted(broken))
+        usable = np.delete(np.arange(len(self.position_m)), sorted(broken_rows))
         if not usable.size:
             raise ReplayError(f"none of the frames of {self.scene.recording.name} can be used")
         rows_ahead = usable[(self.position_m[usable] - here_m) * commanded_m > 0]
@@ -197,7 +197,7 @@ class Stage:
         that can. Raises ReplayError (no frame can be used, or the service names no next move), ApiError,
         TransportError.
         """
-        broken: frozenset[int] = frozenset()
+        broken_rows: frozenset[int] = frozenset()
         here_m, travelled_m, commanded_m = float(self.position_m[row]), 0.0, None
         for step in range(steps + 1):
             while True:
@@ -208,8 +208,8 @@ class Stage:
                 )
                 if not isinstance(outcome, str):
                     break
-                broken |= {row}
-                row = self.nearest(here_m, commanded_m or 0.0, broken)
+                broken_rows |= {row}
+                row = self.nearest(here_m, commanded_m or 0.0, broken_rows)
             action_m = action_m if step else 0.0
             travelled_m += abs(action_m)
             moves = {"step": step, "commanded_m": commanded_m, "action_m": action_m, "travelled_m": travelled_m}
@@ -223,7 +223,7 @@ class Stage:
                     "episodes"
                 )
             here_m, commanded_m = float(self.position_m[row]), plan.action_m
-            row = self.nearest(here_m, commanded_m, broken)
+            row = self.nearest(here_m, commanded_m, broken_rows)
 
     def drive(self, planner: str, number: int, row: int, seed: int, steps: int) -> Episode:
         """Drive one whole episode in a session of its own; raises as `play`."""

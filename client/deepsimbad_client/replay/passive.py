@@ -122,10 +122,10 @@ class _Drive:
         self._n_shown = 0
         self.steps = [record for record in journal.earlier if isinstance(record, Step)]
         ranks = [rank for record in journal.earlier if isinstance(record, list) for rank in record]
-        observed = [row for row, step in enumerate(self.steps) if step.broken is None]
-        self._last = observed[-1] if observed else None
-        self._n_ranked, self._unranked_rows = len(ranks), observed[len(ranks) :]
-        self._rank(observed, ranks)
+        observed_rows = [row for row, step in enumerate(self.steps) if step.broken is None]
+        self._last_row = observed_rows[-1] if observed_rows else None
+        self._n_ranked, self._unranked_rows = len(ranks), observed_rows[len(ranks) :]
+        self._rank(observed_rows, ranks)
         self._show(self._unranked_rows[0] if self._unranked_rows else len(self.steps))
 
     @cached_property
@@ -145,7 +145,7 @@ class _Drive:
         """Post a view, or note why there is none, and write the step to the journal."""
         scene, frame = self._scene, self._scene.recording.frames[row]
         step = Step(row, frame.index, frame.name, frame.position_m, frame.x_m, frame.y_m)
-        action_m = None if self._last is None else float(scene.position_m[row] - scene.position_m[self._last])
+        action_m = None if self._last_row is None else float(scene.position_m[row] - scene.position_m[self._last_row])
         # A key for each view: one that was answered, but not written to the journal, is sent again and counts once.
         options: dict[str, Any] = {"idempotency_key": f"view-{row}", "shortlist": 1}
         outcome = view if isinstance(view, str) else scene.look(self._session, row, view, action_m, **options)
@@ -153,7 +153,7 @@ class _Drive:
             step = replace(step, broken=outcome)
         else:
             step = self._step_with_answer(step, outcome)
-            self._last = row
+            self._last_row = row
             self._unranked_rows.append(row)
         self._journal.append(asdict(step))
         self.steps.append(step)

@@ -36,16 +36,16 @@ Reals = NDArray[np.float64]
 
 def draw_passive(replay: Replay, folder: Path) -> list[Path]:
     """Draw every picture that a passive replay has numbers for; returns the PNG files."""
-    scored = [step for step in replay.steps if step.rank_percent is not None]
-    if not scored:
+    scored_steps = [step for step in replay.steps if step.rank_percent is not None]
+    if not scored_steps:
         return []
     title = f"{replay.identity['recording']}  against  {replay.identity['domain']}"
     pictures = [
-        _rank_along_route(scored, title, folder / "rank_along_route.png"),
+        _rank_along_route(scored_steps, title, folder / "rank_along_route.png"),
         _belief_along_drive(replay, title, folder / "belief_along_drive.png"),
     ]
-    if replay.route.x_m is not None and any(step.x_m is not None for step in scored):
-        pictures.append(_route_map(replay, scored, title, folder / "route_map.png"))
+    if replay.route.x_m is not None and any(step.x_m is not None for step in scored_steps):
+        pictures.append(_route_map(replay, scored_steps, title, folder / "route_map.png"))
     return pictures
 
 
@@ -58,16 +58,18 @@ def draw_active(replay: ActiveReplay, summary: Mapping[str, Any], folder: Path) 
     return pictures
 
 
-def _rank_along_route(scored: Sequence[Step], title: str, path: Path) -> Path:
+def _rank_along_route(scored_steps: Sequence[Step], title: str, path: Path) -> Path:
     """Draw the rank of the truth at every query, with a running median over it."""
-    position_m = np.array([step.position_m for step in scored])
-    percent = np.array([step.rank_percent for step in scored], np.float64)
+    position_m = np.array([step.position_m for step in scored_steps])
+    percent = np.array([step.rank_percent for step in scored_steps], np.float64)
     order = np.argsort(position_m, kind="stable")
     figure, axes = _figure(title, "Rank of the true place along the route", (11, 4.6))
     axes.scatter(position_m, np.maximum(percent, LEAST_PERCENT), s=11, color=DOT, alpha=0.75, lw=0, label="query")
-    window = max(5, len(scored) // 40) | 1
-    ordered, half = percent[order], window // 2
-    smooth = np.array([np.median(ordered[max(0, row - half) : row + half + 1]) for row in range(len(ordered))])
+    window = max(5, len(scored_steps) // 40) | 1
+    ordered_percent, half = percent[order], window // 2
+    smooth = np.array(
+        [np.median(ordered_percent[max(0, row - half) : row + half + 1]) for row in range(len(ordered_percent))]
+    )
     label = f"median of {window} neighbours"
     axes.plot(position_m[order], np.maximum(smooth, LEAST_PERCENT), color=LINE, lw=2, label=label)
     axes.set_yscale("log")
@@ -109,9 +111,9 @@ def _belief_along_drive(replay: Replay, title: str, path: Path) -> Path:
     return _save(figure, path)
 
 
-def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -> Path:
+def _route_map(replay: Replay, scored_steps: Sequence[Step], title: str, path: Path) -> Path:
     """Draw the route from above: every query at its true place, coloured by its error, joined to a far best match."""
-    placed_steps = [step for step in scored if step.x_m is not None and step.y_m is not None]
+    placed_steps = [step for step in scored_steps if step.x_m is not None and step.y_m is not None]
     x, y, error = np.array([(step.x_m, step.y_m, step.error_m) for step in placed_steps], float).T
     tolerance = float(replay.identity["tolerance_m"])
     figure, axes = _figure(title, "Where the best match misses", (8.6, 7.2))
@@ -120,8 +122,8 @@ def _route_map(replay: Replay, scored: Sequence[Step], title: str, path: Path) -
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    far = [step for step in placed_steps if (step.error_m or 0) > 5 * tolerance and step.best_x_m is not None]
-    segments = [[(step.x_m, step.y_m), (step.best_x_m, step.best_y_m)] for step in far]
+    far_steps = [step for step in placed_steps if (step.error_m or 0) > 5 * tolerance and step.best_x_m is not None]
+    segments = [[(step.x_m, step.y_m), (step.best_x_m, step.best_y_m)] for step in far_steps]
     lines = LineCollection(segments, colors=CHANCE, linewidths=0.5, alpha=0.3, zorder=2)  # type: ignore[arg-type]
     axes.add_collection(lines)
     axes.plot([], [], color=CHANCE, lw=1, alpha=0.6, label=f"to a best match over {5 * tolerance:g} m off")

@@ -214,9 +214,9 @@ def planner_label(name: str, service_name: str) -> str:
 
 def _by_step(episodes: Sequence[Episode], resampling: Resampling) -> dict[str, list[Any]]:
     error_m = figures(episodes, "error_m")
-    near = {near_m: 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M}
+    shares = {near_m: 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M}
     figures_with_bands = {"anr": figures(episodes, "rank_percent"), "error": error_m}
-    figures_with_bands |= {f"within_{near_m:g}_m": share for near_m, share in near.items()}
+    figures_with_bands |= {f"within_{near_m:g}_m": share for near_m, share in shares.items()}
     by_step: dict[str, list[Any]] = {
         "travelled_m": _means(figures(episodes, "travelled_m")),
         "median_error_m": [_middle(column) for column in error_m.T],

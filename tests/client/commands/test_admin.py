@@ -1,4 +1,4 @@
-"""What an administrator does from a terminal, against the real service."""
+"""An administrator's commands against the real service."""
 
 import hashlib
 import json
@@ -14,18 +14,18 @@ from deepsimbad_client.commands import run
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 
-from ..conftest import ENCODINGS, mapped
+from ..conftest import ENCODINGS, make_map
 
 QUICK = ("--n-landmarks", "50", "--training-episodes", "0", "--json")
 
 
 @pytest.fixture(scope="module")
 def domain(service, encodings, tmp_path_factory):
-    """A domain with one map, of summer, and a drive of noise to make worse ones of."""
+    """A domain with one map, of summer, and a drive of noise that makes a worse map."""
     noise = tmp_path_factory.mktemp("noise") / "noise.npy"
     np.save(noise, np.random.default_rng(1).normal(size=(120, 32)).astype(np.float32))
     with Client(service) as client:
-        mapped(client, "season", encodings)
+        make_map(client, "season", encodings)
         for file in (encodings / "winter.npy", noise):
             upload(client, open_source(str(file)), "season", file.stem)
     return "season"
@@ -33,7 +33,7 @@ def domain(service, encodings, tmp_path_factory):
 
 @pytest.fixture
 def out(client, capsys, monkeypatch):
-    """Runs a command that succeeds, and gives what it printed, read where it is JSON."""
+    """Runs a command that succeeds, and returns its standard output, parsed where it is JSON."""
     monkeypatch.setenv("DEEPSIMBAD_URL", client.url)
 
     def printed(*command):
@@ -46,7 +46,7 @@ def out(client, capsys, monkeypatch):
 
 @pytest.fixture
 def refused(capsys, monkeypatch, client):
-    """Runs a command that is refused with a code, and says so in these words."""
+    """Runs a command that ends with this exit code and these words on standard error."""
     monkeypatch.setenv("DEEPSIMBAD_URL", client.url)
 
     def refused(code, words, *command):
@@ -93,12 +93,12 @@ def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(client, domain, 
 
 
 def test_a_drive_is_appended(client, domain, out, refused):
-    before = client.domain(domain)
+    old_domain = client.domain(domain)
     job = out("remap", "--domain", domain, "--training", "winter", "--append", "--no-activate", "--json")
-    client.admin.activate(domain, job["result"]["map_version"], expected=before.map_version)
-    after = client.domain(domain)
-    client.admin.activate(domain, before.map_version)
-    assert (before.n_map_images, after.n_map_images) == (120, 120), "the same places, seen in one more season"
+    client.admin.activate(domain, job["result"]["map_version"], expected=old_domain.map_version)
+    new_domain = client.domain(domain)
+    client.admin.activate(domain, old_domain.map_version)
+    assert (old_domain.n_map_images, new_domain.n_map_images) == (120, 120), "the same places, seen in one more season"
     command = ["remap", "--domain", domain, "--training", "winter", "--append", "--landmarks", "landmarks"]
     refused(2, "leave --landmarks out", *command)
 
@@ -133,8 +133,8 @@ def test_sessions_and_traverses_are_listed_and_ended(client, domain, out):
     assert 0 <= score.anr <= 100
     assert session.truths([None]).anr is None
     assert session.session_id in out("sessions", "--domain", domain)
-    (listed,) = out("sessions", "--domain", domain, "--json")
-    assert (listed["session_id"], listed["n_observations"]) == (session.session_id, 1)
+    (entry,) = out("sessions", "--domain", domain, "--json")
+    assert (entry["session_id"], entry["n_observations"]) == (session.session_id, 1)
     deleted = out("delete-session", session.session_id, "--yes", "--json")
     assert deleted == {"session_id": session.session_id, "deleted": True}
     assert out("sessions", "--domain", domain, "--json") == []

@@ -1,4 +1,4 @@
-"""Tables, off a terminal with whole names, what they say of maps, and waits that a person is told of."""
+"""Tables, whose names are whole off a terminal, their words for maps, and waits that a person is told of."""
 
 import io
 import logging
@@ -15,34 +15,34 @@ from deepsimbad_client.http.models import Domain, Job
 
 
 @pytest.fixture
-def shown(capsys, monkeypatch):
-    """What a pipe gets of a table, by line."""
+def table_lines(capsys, monkeypatch):
+    """The lines of a table as a pipe gets them."""
     monkeypatch.delenv("COLUMNS", raising=False)
 
-    def shown(table):
+    def table_lines(table):
         show(table)
         return capsys.readouterr().out.splitlines()
 
-    return shown
+    return table_lines
 
 
-def test_a_table_in_a_pipe_cuts_no_name_and_heeds_columns(shown, monkeypatch):
+def test_a_table_in_a_pipe_cuts_no_name_and_heeds_columns(table_lines, monkeypatch):
     table = domain_table([Domain(name="a" * 64, evaluator={"kind": "feature_l2"})])
-    printed = "".join(shown(table))
+    printed = "".join(table_lines(table))
     for words in ("a" * 64, "feature_l2", "landmarks"):
         assert words in printed
     monkeypatch.setenv("COLUMNS", "60")
-    assert max(map(len, shown(table))) <= 60
+    assert max(map(len, table_lines(table))) <= 60
 
 
-def test_jobs_are_shown_with_what_they_do_and_the_time_left(shown):
+def test_jobs_are_shown_with_what_they_do_and_the_time_left(table_lines):
     states: dict[str, dict[str, Any]] = {
         "waits": {"state": "queued"},
         "began": {"state": "running"},
         "works": {"state": "running", "stage": "read_frames", "progress": 0.25, "eta_s": 524.4},
         "ended": {"state": "failed", "error": {"code": "damaged_file", "detail": "traverse drive: damaged"}},
     }
-    lines = shown(job_table([Job(job_id=name, domain="d", **state) for name, state in states.items()]))
+    lines = table_lines(job_table([Job(job_id=name, domain="d", **state) for name, state in states.items()]))
     rows = {line.split()[1]: line for line in lines if "│" in line}
     assert "waiting for its turn" in rows["waits"]
     assert "beginning, 0 %" in rows["began"]
@@ -92,8 +92,10 @@ def test_the_bar_shows_what_happens(monkeypatch):
         assert words in screen.getvalue()
 
 
-def test_a_map_that_does_not_answer_says_why(shown):
-    lines = shown(domain_table([Domain(name="yard", map_version=3, map_problem="damaged_map"), Domain(name="loop")]))
+def test_a_map_that_does_not_answer_says_why(table_lines):
+    lines = table_lines(
+        domain_table([Domain(name="yard", map_version=3, map_problem="damaged_map"), Domain(name="loop")])
+    )
     (damaged,) = [line for line in lines if "yard" in line]
     assert "3 damaged_map" in damaged
 
@@ -113,11 +115,11 @@ LOST_GATE = {"gate_margin": 0.0, "passed": False}
         (CHECK | {"anr": None}, None),
     ],
 )
-def test_a_map_is_shown_with_both_figures_where_it_was_compared(shown, check, words):
+def test_a_map_is_shown_with_both_figures_where_it_was_compared(table_lines, check, words):
     is_active = not check or check.get("passed") is not False
     result = {"map_version": 7, "active": is_active, "metrics": {"check": check and {"passed": None, **check}}}
     job = Job(job_id="0" * 32, domain="d", state="succeeded", progress=1.0, result=result)
-    line = " ".join(" ".join(shown(job_table([job]))).replace("│", " ").split())
+    line = " ".join(" ".join(table_lines(job_table([job]))).replace("│", " ").split())
     assert (words or "map 7") in line
     assert words is not None or "ANR" not in line
 
@@ -134,5 +136,5 @@ def test_a_ctrl_c_says_whether_the_same_command_goes_on(monkeypatch, capsys, com
 
     monkeypatch.setattr(cli, "main", interrupted)
     assert run([command]) == 130
-    told = "; the same command goes on where it stopped" if goes_on else ""
-    assert capsys.readouterr().err == f"deepsimbad-client: cancelled{told}\n"
+    advice = "; the same command goes on where it stopped" if goes_on else ""
+    assert capsys.readouterr().err == f"deepsimbad-client: cancelled{advice}\n"

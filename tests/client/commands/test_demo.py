@@ -1,4 +1,4 @@
-"""What the demonstration says of its planners."""
+"""The demonstration's verdict on its planners."""
 
 import pytest
 
@@ -19,10 +19,10 @@ OURS, RANDOM, CONSTANT = PLANNERS
 def test_it_says_honestly_which_planner_won(anr, ends, says):
     summary = {
         "anr": dict(zip(PLANNERS, anr, strict=True)),
-        "against": {name: {"interval_95": each} for name, each in zip((RANDOM, CONSTANT), ends, strict=True)},
+        "against": {name: {"interval_95": interval} for name, interval in zip((RANDOM, CONSTANT), ends, strict=True)},
         "planner_named": {OURS: "informed", RANDOM: RANDOM, CONSTANT: CONSTANT},
     }
-    told = _verdict(summary)
-    assert told.endswith(says)
+    verdict = _verdict(summary)
+    assert verdict.endswith(says)
     if anr[0] is not None:
-        assert (f"informed (default), {anr[0]:.2f} %" in told) == (anr[0] == min(anr))
+        assert (f"informed (default), {anr[0]:.2f} %" in verdict) == (anr[0] == min(anr))

@@ -17,12 +17,12 @@ from ..http.scripted import answer
 EVENTS = "/v1/admin/jobs/7/events"
 
 
-def job(state, progress=0.0, **more):
-    return {"job_id": "7", "domain": "d", "state": state, "progress": progress, **more}
+def job(state, progress=0.0, **fields):
+    return {"job_id": "7", "domain": "d", "state": state, "progress": progress, **fields}
 
 
 def stream(*events, breaks_off=False):
-    """What gives some events and ends, or breaks off."""
+    """A function that makes a response of some events, which ends or breaks off."""
 
     class Events(httpx2.SyncByteStream):
         def __iter__(self):
@@ -39,13 +39,13 @@ class Service:
 
     def __init__(self, streams, answers):
         self.queues = {True: streams, False: answers}
-        self.asked: list[str] = []
-        self.now = 0.0
+        self.paths: list[str] = []
+        self.time_s = 0.0
         self.heard: list[Job] = []
         self.silences: list[float] = []
 
     def __call__(self, request):
-        self.asked.append(request.url.path)
+        self.paths.append(request.url.path)
         queue = self.queues[request.url.path == EVENTS]
         outcome = queue.pop(0) if len(queue) > 1 else queue[0]
         if isinstance(outcome, type):
@@ -55,7 +55,7 @@ class Service:
         return outcome if isinstance(outcome, httpx2.Response) else httpx2.Response(200, json=outcome)
 
     def sleep(self, seconds):
-        self.now += seconds
+        self.time_s += seconds
 
     def follow(self, patience_s=60.0):
         retry = RetryPolicy(attempts=1)
@@ -65,7 +65,7 @@ class Service:
             on_silence=self.silences.append,
             patience_s=patience_s,
             sleep=self.sleep,
-            clock=lambda: self.now,
+            clock=lambda: self.time_s,
         )
 
 
@@ -98,7 +98,7 @@ def test_a_job_is_followed_to_its_end(streams, answers, heard):
     service = Service([*streams], [*answers])
     assert service.follow().state == "succeeded"
     assert [job.progress for job in service.heard] == heard
-    assert service.asked.count(EVENTS) == len(streams)
+    assert service.paths.count(EVENTS) == len(streams)
     assert service.silences == ([0.0, 2.0] if STARTING in streams else service.silences)
 
 
@@ -120,9 +120,9 @@ def test_a_refusal_ends_it(status, code, error, words):
     ("state", "error"), [("failed", errors.JobFailedError), ("cancelled", errors.JobCancelledError)]
 )
 def test_a_job_without_success_is_an_error(state, error):
-    ended = job(state, error={"code": "too_few_candidates", "detail": "only 3 candidates"})
+    last_job = job(state, error={"code": "too_few_candidates", "detail": "only 3 candidates"})
     with pytest.raises(error) as raised:
-        Service([stream(ended)], [ended]).follow()
+        Service([stream(last_job)], [last_job]).follow()
     assert raised.value.job.state == state
     assert state != "failed" or "only 3 candidates" in str(raised.value)
 
@@ -131,30 +131,30 @@ def test_silence_is_not_waited_out_for_ever():
     service = Service([LOST], [LOST])
     with pytest.raises(errors.TransportError):
         service.follow(patience_s=60)
-    assert 60 < service.now < 120
+    assert 60 < service.time_s < 120
 
 
 @pytest.fixture
 def responding(monkeypatch):
-    """Lets commands talk to a service of one function; returns what they asked, as "VERB path"."""
+    """Lets commands talk to a service of one function; returns the list of their requests, as "VERB path"."""
 
     def responding(respond):
-        asked = []
+        requests = []
 
         def handle(request):
-            asked.append(f"{request.method} {request.url.path}")
+            requests.append(f"{request.method} {request.url.path}")
             return httpx2.Response(204) if request.method == "DELETE" else respond(request)
 
         transport = httpx2.MockTransport(handle)
         monkeypatch.setattr(console, "Client", lambda url, key: Client(url, key, transport=transport))
-        return asked
+        return requests
 
     return responding
 
 
 @pytest.fixture
 def confirming(monkeypatch):
-    """A person at a terminal who answers so, or presses Ctrl-C; returns what they were asked."""
+    """Puts a person at the terminal who gives this reply, or presses Ctrl-C (None); returns the list of questions."""
 
     def confirming(reply):
         questions = []
@@ -184,20 +184,20 @@ def test_ctrl_c_asks_whether_to_cancel(command, reply, responding, confirming, c
             raise KeyboardInterrupt
         return httpx2.Response(202, json=job("running"))
 
-    asked, questions = responding(respond), confirming(reply)
+    requests, questions = responding(respond), confirming(reply)
     assert run([*command, "--server", "http://service"]) == 130
     assert questions == ["Cancel job 7 on the server too?"]
-    assert asked.count("DELETE /v1/admin/jobs/7") == (reply is True)
+    assert requests.count("DELETE /v1/admin/jobs/7") == (reply is True)
     assert ("job 7 is being cancelled" if reply else "deepsimbad-client jobs 7 --follow") in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("reply", "code"), [(True, 0), (False, 130), (None, 130)])
 def test_a_deletion_is_asked_about(reply, code, responding, confirming):
-    asked = responding(lambda request: httpx2.Response(200, json={"name": "t", "n_frames": 12}))
+    requests = responding(lambda request: httpx2.Response(200, json={"name": "t", "n_frames": 12}))
     questions = confirming(reply)
     assert run(["delete-traverse", "d", "t", "--server", "http://service"]) == code
     assert questions == ["Delete traverse t of domain d with its 12 frames?"]
-    assert asked.count("DELETE /v1/admin/domains/d/traverses/t") == (reply is True)
+    assert requests.count("DELETE /v1/admin/domains/d/traverses/t") == (reply is True)
 
 
 @pytest.mark.parametrize(
@@ -209,9 +209,9 @@ def test_a_deletion_is_asked_about(reply, code, responding, confirming):
     ],
 )
 def test_a_cancel_says_what_came_of_it(state, words, responding, capsys):
-    asked = responding(lambda request: httpx2.Response(200, json=job(state)))
+    requests = responding(lambda request: httpx2.Response(200, json=job(state)))
     assert run(["jobs", "7", "--cancel", "--json", "--server", "http://service"]) == 0
-    shown = capsys.readouterr()
-    assert asked == ["DELETE /v1/admin/jobs/7", "GET /v1/admin/jobs/7"]
-    assert shown.err == f"{words}\n"
-    assert json.loads(shown.out)["state"] == state
+    printed = capsys.readouterr()
+    assert requests == ["DELETE /v1/admin/jobs/7", "GET /v1/admin/jobs/7"]
+    assert printed.err == f"{words}\n"
+    assert json.loads(printed.out)["state"] == state

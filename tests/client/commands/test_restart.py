@@ -25,10 +25,10 @@ def test_the_demonstration_on_a_tiny_campus(rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(demonstration, "RELEVANCES", demonstration.RELEVANCES[-1:])
     monkeypatch.setattr(demonstration, "EPISODES", 2)
     shutil.copytree(rendered, tmp_path / "demo" / "campus", copy_function=os.link)
-    ended = CliRunner().invoke(demonstration.demo, [str(tmp_path / "demo"), "--frames", "36"], catch_exceptions=False)
-    assert ended.exit_code == 0
+    result = CliRunner().invoke(demonstration.demo, [str(tmp_path / "demo"), "--frames", "36"], catch_exceptions=False)
+    assert result.exit_code == 0
     for words in ("composed (default)", "It looks and sees", "Move 1: it goes", "constant:10", "8. Pictures:"):
-        assert words in ended.stdout
+        assert words in result.stdout
     assert (tmp_path / "demo" / "active" / "belief_by_step.png").exists()
 
 
@@ -49,8 +49,8 @@ def test_a_job_and_a_session_outlive_their_service(tmp_path, encodings, is_kille
         for name in ("landmarks", "summer"):
             upload(client, open_source(str(encodings / f"{name}.npy")), "d", name)
         job = client.admin.remap("d", training_traverse="summer", landmark_traverse="landmarks", n_landmarks=50)
-        ended: list[Job] = []
-        follower = threading.Thread(target=lambda: ended.append(follow_job(client, job.job_id, hear)))
+        last_jobs: list[Job] = []
+        follower = threading.Thread(target=lambda: last_jobs.append(follow_job(client, job.job_id, hear)))
         follower.start()
         try:
             assert has_begun.wait(60), heard
@@ -59,9 +59,9 @@ def test_a_job_and_a_session_outlive_their_service(tmp_path, encodings, is_kille
             server.start()
         finally:
             follower.join(240)
-        (done,) = ended
-        assert done.state == "succeeded"
-        assert (done.result or {})["map_version"] in {1, 2}  # a number that was begun is not used again
+        (last_job,) = last_jobs
+        assert last_job.state == "succeeded"
+        assert (last_job.result or {})["map_version"] in {1, 2}  # a number that was begun is not used again
         assert not last.ended
         assert len(heard) > heard.index(last) + 1
 

@@ -1,4 +1,4 @@
-"""The client against the real service: nothing between them is pretended."""
+"""The client against the real service, with nothing simulated between them."""
 
 import json
 import re
@@ -32,15 +32,15 @@ def test_an_upload_goes_on_where_it_stopped(client, encodings, monkeypatch):
     assert client.admin.traverse("again", "t").missing == ((0, 9),)
     report = upload(client, open_source(str(encodings / "summer.npy")), "again", "t")
     assert (report.n_skipped, report.n_sent) == (20, 100)
-    there = client.admin.traverse("again", "t")
-    assert (there.n_frames, there.missing) == (120, ())
-    again = upload(client, open_source(str(encodings / "summer.npy")), "again", "t")
-    assert (again.n_skipped, again.n_sent) == (120, 0)
+    stored = client.admin.traverse("again", "t")
+    assert (stored.n_frames, stored.missing) == (120, ())
+    report_again = upload(client, open_source(str(encodings / "summer.npy")), "again", "t")
+    assert (report_again.n_skipped, report_again.n_sent) == (120, 0)
     with pytest.raises(errors.OtherFramesError, match="again/t holds other frames than winter: 120 of the 120 that"):
         upload(client, open_source(str(encodings / "winter.npy")), "again", "t")
     with pytest.raises(errors.OtherFramesError, match="90 frames there are not of this recording, so delete it"):
         upload(client, open_source(f"{encodings / 'winter.npy'}#:30"), "again", "t", replace=True)
-    assert client.admin.traverse("again", "t") == there
+    assert client.admin.traverse("again", "t") == stored
 
 
 def test_another_drive_or_corrected_positions_never_pass_for_what_is_there(client, tmp_path, capsys):
@@ -77,20 +77,20 @@ def test_another_drive_or_corrected_positions_never_pass_for_what_is_there(clien
         assert client.admin.traverse("identity", "drive") == first
     code, out, _ = ran([*drive("summer", 1, 6, 7), "--replace"])
     assert (code, "5 frames sent" in out, "1 were there already" in out) == (0, True, True)
-    moved = client.admin.traverse("identity", "drive")
-    assert (moved.n_frames, moved.length_m) == (6, 35.0)
+    corrected = client.admin.traverse("identity", "drive")
+    assert (corrected.n_frames, corrected.length_m) == (6, 35.0)
     assert ran([*drive("summer", 1, 6, 1), "--replace"])[0] == 0
-    assert client.admin.traverse("identity", "drive").digest == first.digest != moved.digest
+    assert client.admin.traverse("identity", "drive").digest == first.digest != corrected.digest
     assert ran([*drive("winter", 2, 8, 1), "--replace"])[0] == 0
     assert client.admin.traverse("identity", "drive").n_frames == 8
 
 
 def test_results_come_in_order_and_work_never_runs_far_ahead():
-    begun: list[int] = []
+    items: list[int] = []
     release = threading.Event()
 
     def work(item):
-        begun.append(item)
+        items.append(item)
         if item == 0:
             release.wait(60)
         return item * item
@@ -98,22 +98,22 @@ def test_results_come_in_order_and_work_never_runs_far_ahead():
     results = in_order(work, range(100), 4)
     release.set()
     assert next(results) == (0, 0)
-    assert max(begun) < 8
+    assert max(items) < 8
     assert [result for _, result in results] == [item * item for item in range(1, 100)]
 
 
 def test_a_failure_comes_in_its_turn_and_stops_the_rest():
-    begun: list[int] = []
+    items: list[int] = []
 
     def work(item):
-        begun.append(item)
+        items.append(item)
         if item == 5:
             raise errors.ReplayError("five")
         return item
 
     with pytest.raises(errors.ReplayError, match="five"):
         list(in_order(work, range(1000), 2))
-    assert len(begun) < 20
+    assert len(items) < 20
 
 
 def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
@@ -128,12 +128,12 @@ def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
     report = upload(client, open_source(str(folder)), "pictures", "t", concurrency=3)
     assert (report.n_sent, report.n_broken.total(), report.broken_names) == (7, 1, ["3.jpg"])
     remap(client, "pictures", "t", landmark_traverse="t", n_landmarks=5, list_length=2)
-    driven = replay(client, open_source(str(folder)), "pictures", tmp_path / "out", tolerance_m=0, concurrency=2)
-    summary = summarise(driven)
+    result = replay(client, open_source(str(folder)), "pictures", tmp_path / "out", tolerance_m=0, concurrency=2)
+    summary = summarise(result)
     assert (summary["n_queries"], summary["n_broken"], summary["left_out"]) == (7, *[dict(report.n_broken)] * 2)
     too_many = "frames_left_out: 12% of the frames of images are left out: 1 undecodable (3.jpg); more than 5% need"
-    used = (["upload", "--traverse", "again"], ["replay", "--out", str(tmp_path / "again"), "--no-plots"])
-    for command in used:
+    commands = (["upload", "--traverse", "again"], ["replay", "--out", str(tmp_path / "again"), "--no-plots"])
+    for command in commands:
         command += ["--server", client.url, "--domain", "pictures", str(folder)]
         capsys.readouterr()
         assert run(command) == 1
@@ -182,11 +182,11 @@ def test_a_robot_that_may_go_backward_drives_a_map_of_its_own_landmarks(
     service, encodings, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setenv("DEEPSIMBAD_URL", service)
-    sent = ["upload", str(encodings / "summer.npy"), "--domain", "own", "--traverse", "summer", "--actions-m"]
-    assert run([*sent, "1,x"]) == 2
-    assert run([*sent, "1,-5"]) == 1
+    upload_command = ["upload", str(encodings / "summer.npy"), "--domain", "own", "--traverse", "summer", "--actions-m"]
+    assert run([*upload_command, "1,x"]) == 2
+    assert run([*upload_command, "1,-5"]) == 1
     assert "ascend" in capsys.readouterr().err
-    assert run([*sent, "-5,0,1,10"]) == 0
+    assert run([*upload_command, "-5,0,1,10"]) == 0
     capsys.readouterr()
     command = ["remap", "--domain", "own", "--training", "summer", "--n-landmarks", "40", "--json"]
     assert run(command) == 0
@@ -198,12 +198,12 @@ def test_a_robot_that_may_go_backward_drives_a_map_of_its_own_landmarks(
     assert run(command) == 0
     assert json.loads(capsys.readouterr().out)["result"]["metrics"]["landmarks"] == "active_map"
     planners = ("constant:-5", "constant:0")
-    driven = ["replay", str(encodings / "winter.npy"), "--domain", "own", "--out", str(tmp_path), "--no-plots"]
-    asked = [word for planner in planners for word in ("--planner", planner)]
-    assert run([*driven, *asked, "--episodes", "2", "--steps", "2"]) == 0
+    replay_command = ["replay", str(encodings / "winter.npy"), "--domain", "own", "--out", str(tmp_path), "--no-plots"]
+    planner_words = [word for planner in planners for word in ("--planner", planner)]
+    assert run([*replay_command, *planner_words, "--episodes", "2", "--steps", "2"]) == 0
     steps = [json.loads(line) for line in (tmp_path / "steps.jsonl").read_text().splitlines()]
-    moved = {planner: [step["action_m"] for step in steps if step["planner"] == planner] for planner in planners}
-    assert moved == {"constant:-5": 2 * [0, -5, -5], "constant:0": 6 * [0]}
+    moves_m = {planner: [step["action_m"] for step in steps if step["planner"] == planner] for planner in planners}
+    assert moves_m == {"constant:-5": 2 * [0, -5, -5], "constant:0": 6 * [0]}
     assert max(step["travelled_m"] for step in steps) == 10
     assert all(step["error_m"] < 1 for step in steps if step["step"] == 2)
 
@@ -219,26 +219,26 @@ def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
     remap(client, "places", "t", landmark_traverse="t", n_landmarks=6, list_length=2)
     command = ["localize", "--server", client.url]
     assert run([*command, "--json", "--domain", "places", str(folder / "4.png"), f"{folder}#1:3"]) == 0
-    placed = json.loads(capsys.readouterr().out)
-    assert [answer["retrieval"][0]["map_image"] for answer in placed] == [4, 1, 2]
-    assert [answer["belief"]["top"][0]["frame"] for answer in placed] == ["4.png", "1.png", "2.png"]
+    answers = json.loads(capsys.readouterr().out)
+    assert [answer["retrieval"][0]["map_image"] for answer in answers] == [4, 1, 2]
+    assert [answer["belief"]["top"][0]["frame"] for answer in answers] == ["4.png", "1.png", "2.png"]
     assert run([*command, "--json", "--domain", "route", f"{encodings / 'summer.npy'}#7:8"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["retrieval"][0]["map_image"] == 7
     assert run([*command, "--domain", "places", str(folder / "4.png")]) == 0
-    shown = capsys.readouterr().out
-    assert "likeliest [m]" in shown
-    assert re.search(r"4\.png +│ 4\.png +│ +4\.0", shown), shown
+    printed = capsys.readouterr().out
+    assert "likeliest [m]" in printed
+    assert re.search(r"4\.png +│ 4\.png +│ +4\.0", printed), printed
     client.admin.warm("places")
-    for named in ("places,route", "*"):
-        assert run([*command, "--json", named, str(folder / "4.png")]) == 0
+    for domains in ("places,route", "*"):
+        assert run([*command, "--json", domains, str(folder / "4.png")]) == 0
         (anywhere,) = json.loads(capsys.readouterr().out)
         assert (anywhere["domains"][0]["domain"], anywhere["top"][0]["map_image"]) == ("places", 4)
         assert "route" in [out["domain"] for out in anywhere["left_out"]]
     assert run([*command, "places,route", str(folder / "4.png")]) == 0
-    shown = capsys.readouterr()
-    assert re.search(r"4\.png +│ places +│ +\d+\.\d +│ 4\.png", shown.out), shown.out
-    assert "elsewhere" in shown.out
-    assert "route is left out" in shown.err
+    printed = capsys.readouterr()
+    assert re.search(r"4\.png +│ places +│ +\d+\.\d +│ 4\.png", printed.out), printed.out
+    assert "elsewhere" in printed.out
+    assert "route is left out" in printed.err
     answer = client.localize_anywhere(folder / "4.png", domains=["places", "route"], in_full=1)
     assert [out.code for out in answer.left_out] == ["unsupported_media_type"]
     assert answer.domains[0].probability + answer.others.probability + answer.elsewhere == pytest.approx(1)
@@ -250,11 +250,11 @@ def test_a_second_drive_that_shares_no_frame_with_the_first_is_refused_and_a_par
     client.admin.put_domain("parts", ENCODINGS)
     summer, winter = (str(encodings / f"{season}.npy") for season in ("summer", "winter"))
     upload(client, open_source(f"{summer}#:60"), "parts", "t")
-    there = client.admin.traverse("parts", "t")
+    stored = client.admin.traverse("parts", "t")
     for replace in (False, True):
         with pytest.raises(errors.OtherFramesError, match="another recording than winter: 60 beside"):
             upload(client, open_source(f"{winter}#60:"), "parts", "t", replace=replace)
-    assert client.admin.traverse("parts", "t") == there
+    assert client.admin.traverse("parts", "t") == stored
     assert upload(client, open_source(f"{summer}#60:"), "parts", "t").n_sent == 60
     assert upload(client, open_source(f"{summer}#100:"), "parts", "t").n_skipped == 20
 

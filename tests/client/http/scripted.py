@@ -27,12 +27,12 @@ LOCALIZATION = {
 
 
 def answer(status, document=None, **headers):
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    return httpx2.Response(status, json=document, headers=named)
+    fields = {name.replace("_", "-"): value for name, value in headers.items()}
+    return httpx2.Response(status, json=document, headers=fields)
 
 
 class Script:
-    """Gives one outcome after the other, the last of them for ever, and remembers what was asked."""
+    """Answers with one outcome after the other, the last of them for ever, and records the requests."""
 
     def __init__(self, *outcomes):
         self.outcomes = list(outcomes)
@@ -47,5 +47,5 @@ class Script:
         raise outcome("scripted", request=request)
 
     def client(self, url="http://service/", key=None, **options):
-        given = {"retry": POLICY, "sleep": self.slept.append, "jitter": lambda: 1.0, **options}
-        return Client(url, key, transport=httpx2.MockTransport(self), **given)
+        arguments = {"retry": POLICY, "sleep": self.slept.append, "jitter": lambda: 1.0, **options}
+        return Client(url, key, transport=httpx2.MockTransport(self), **arguments)

@@ -1,4 +1,4 @@
-"""A map on its way into a file: every byte checked, nothing fetched twice, nothing half in its place."""
+"""The download of a map: every byte checked, nothing fetched twice, no half file in its place."""
 
 import hashlib
 
@@ -20,7 +20,7 @@ def sha256(body):
 
 
 class Broken(httpx2.SyncByteStream, httpx2.AsyncByteStream):
-    """The beginning of a body, then the end of the link."""
+    """A stream of the beginning of a body, and then a broken link."""
 
     def __init__(self, body):
         self.body = body
@@ -49,13 +49,13 @@ class Shelf:
     def __call__(self, request):
         assert request.url.path == PATH
         assert request.headers["accept-encoding"] == "identity"
-        asked = request.headers.get("range", "")
-        self.ranges.append(asked)
+        range_header = request.headers.get("range", "")
+        self.ranges.append(range_header)
         etag = f'"sha256:{sha256(self.body)}"'
         headers = {"etag": etag, "content-length": str(len(self.body)), **self.headers}
         status, content = 200, self.body
-        if asked and request.headers["if-range"] == etag:
-            first = int(asked.removeprefix("bytes=").removesuffix("-"))
+        if range_header and request.headers["if-range"] == etag:
+            first = int(range_header.removeprefix("bytes=").removesuffix("-"))
             if first >= len(self.body):
                 return httpx2.Response(416, json={"code": "invalid_range", "detail": "beyond the end"})
             status, content = 206, self.body[first:]

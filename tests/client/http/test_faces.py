@@ -25,7 +25,7 @@ from .scripted import JOB, POLICY, STATE, Script, answer
 from .test_requests import JOBS, shelf
 
 Ask = Callable[[Any, Any, Path], Any]
-"""From a client, one of its sessions and a file: what the call gives."""
+"""A call of a client, one of its sessions or a file."""
 
 ASKED: dict[str, Ask] = {
     "GET /healthz": lambda c, s, f: c.health(),
@@ -119,23 +119,23 @@ def test_both_faces_show_signature_and_docstring(faces):
     calls = [name for name, _ in inspect.getmembers(blocking, inspect.isfunction) if name[0] != "_" and name != "close"]
     assert len(calls) > 6
     for name in calls:
-        ours, theirs = getattr(blocking, name), getattr(awaiting, name)
-        assert inspect.signature(ours) == inspect.signature(theirs)
-        assert ours.__doc__ == theirs.__doc__ != ""
-        assert not inspect.iscoroutinefunction(ours)
-        assert inspect.iscoroutinefunction(theirs) != (name in {"job_events", "events"})
+        blocking_call, awaiting_call = getattr(blocking, name), getattr(awaiting, name)
+        assert inspect.signature(blocking_call) == inspect.signature(awaiting_call)
+        assert blocking_call.__doc__ == awaiting_call.__doc__ != ""
+        assert not inspect.iscoroutinefunction(blocking_call)
+        assert inspect.iscoroutinefunction(awaiting_call) != (name in {"job_events", "events"})
 
 
 def run_async(transport, act):
-    """Run what is awaited on an async client; returns what it waited between tries."""
+    """Run `act` on an async client; returns the seconds it slept between tries."""
     slept: list[float] = []
 
     async def sleep(seconds):
         slept.append(seconds)
 
     async def run():
-        given = {"retry": POLICY, "sleep": sleep, "jitter": lambda: 1.0}
-        async with AsyncClient("http://service", transport=httpx2.MockTransport(transport), **given) as client:
+        arguments = {"retry": POLICY, "sleep": sleep, "jitter": lambda: 1.0}
+        async with AsyncClient("http://service", transport=httpx2.MockTransport(transport), **arguments) as client:
             await act(client)
 
     asyncio.run(run())
@@ -153,8 +153,8 @@ def test_the_async_client_obeys_the_same_rules():
 
 
 def test_lists_and_events_in_both_clients():
-    done = {**JOB, "state": "succeeded"}
-    stream = f": ping\n\nevent: progress\ndata: {json.dumps(JOB)}\n\nevent: done\ndata: {json.dumps(done)}\n\n"
+    last_job = {**JOB, "state": "succeeded"}
+    stream = f": ping\n\nevent: progress\ndata: {json.dumps(JOB)}\n\nevent: done\ndata: {json.dumps(last_job)}\n\n"
 
     def events():
         return Script(httpx2.Response(200, content=stream.encode(), headers={"content-type": "text/event-stream"}))

@@ -45,8 +45,8 @@ def content(model):
 def slow_order(body, model):
     evaluator = make_evaluator(evaluator_config(GRADIENTS))
     encoding = evaluator.encode([decode_image(body, 1 << 20)])[0]
-    apart = np.square(model["prototypes"].astype(float) - encoding).sum(axis=1)
-    return sorted(range(N_LANDMARKS), key=lambda landmark: (apart[landmark], landmark))
+    dissimilarities = np.square(model["prototypes"].astype(float) - encoding).sum(axis=1)
+    return sorted(range(N_LANDMARKS), key=lambda landmark: (dissimilarities[landmark], landmark))
 
 
 def test_an_observation_is_64_bytes_of_the_nearest(content, model):
@@ -54,11 +54,11 @@ def test_an_observation_is_64_bytes_of_the_nearest(content, model):
     assert (encoder.map_version, encoder.n_landmarks) == (4, N_LANDMARKS)
     assert encoder.digest == landmark_model_digest(model)
     order = slow_order(picture(1), model)
-    seen = encoder.ranks(picture(1))
-    assert seen.headers == {"Content-Type": RANKS, "If-Match": f'"{encoder.digest}"'}
-    assert len(seen.body) == 64
-    assert encoder.view(picture(1)) == seen, "its map compares ranks"
-    assert list(unpack_ranked_landmarks(seen.body, N_LANDMARKS)) == order[:55]
+    observation = encoder.ranks(picture(1))
+    assert observation.headers == {"Content-Type": RANKS, "If-Match": f'"{encoder.digest}"'}
+    assert len(observation.body) == 64
+    assert encoder.view(picture(1)) == observation, "its map compares ranks"
+    assert list(unpack_ranked_landmarks(observation.body, N_LANDMARKS)) == order[:55]
     for m in (1, 8, N_LANDMARKS):
         assert list(unpack_ranked_landmarks(encoder.ranks(picture(1), m=m).body, N_LANDMARKS)) == order[:m]
 
@@ -87,9 +87,9 @@ def test_ready_encodings_are_ranked_too(model):
     ready = {"kind": "feature_l2", "extractor": "none"}
     encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, ready)))
     encoding = model["prototypes"][7]
-    sent = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=3).body, N_LANDMARKS)
+    landmarks = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=3).body, N_LANDMARKS)
     nearest = rank_landmarks(np.square(model["prototypes"] - encoding).sum(axis=1))
-    assert [nearest[landmark] for landmark in sent] == [1, 2, 3]
+    assert [nearest[landmark] for landmark in landmarks] == [1, 2, 3]
     with pytest.raises(errors.InvalidArgumentError, match="takes ready encodings alone"):
         encoder.ranks(picture(1))
     with pytest.raises(errors.InvalidArgumentError, match="another encoder"):
@@ -98,21 +98,21 @@ def test_ready_encodings_are_ranked_too(model):
 
 def test_landmarks_that_are_unit_vectors_are_ranked_by_what_is_usual_of_encodings():
     rng = np.random.default_rng(1)
-    prototypes, usual, projection = rng.normal(size=(40, 3)), rng.random((2, 8)) + 1, rng.normal(size=(8, 3))
+    prototypes, mean_and_scale, projection = rng.normal(size=(40, 3)), rng.random((2, 8)) + 1, rng.normal(size=(8, 3))
     prototypes /= np.linalg.norm(prototypes, axis=1, keepdims=True)
-    model = {"prototypes": prototypes, "usual": usual, "projection": projection}
+    model = {"prototypes": prototypes, "usual": mean_and_scale, "projection": projection}
     model = {name: array.astype(np.float32) for name, array in model.items()}
     encoder = OnBoardEncoder(
         pack_landmarks(PortableLandmarks(model, 40, 1, {"kind": "feature_l2", "extractor": "none"}))
     )
     encoding = rng.normal(size=8)
-    likeness = prototypes @ ((encoding - usual[0]) / usual[1] @ projection)
-    sent = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=40).body, 40)
-    assert list(sent) == np.argsort(-likeness).tolist()
-    u = (encoding - usual[0]) / usual[1] @ projection
-    seen = encoder.view(encoding=encoding, n_bits=8)
-    assert seen.headers == {"Content-Type": UNIT_ENCODING, "If-Match": f'"{encoder.digest}"'}
-    assert unpack_unit_encoding(seen.body, 3) == pytest.approx(u / np.linalg.norm(u), abs=0.01)
+    likeness = prototypes @ ((encoding - mean_and_scale[0]) / mean_and_scale[1] @ projection)
+    landmarks = unpack_ranked_landmarks(encoder.ranks(encoding=encoding, m=40).body, 40)
+    assert list(landmarks) == np.argsort(-likeness).tolist()
+    u = (encoding - mean_and_scale[0]) / mean_and_scale[1] @ projection
+    observation = encoder.view(encoding=encoding, n_bits=8)
+    assert observation.headers == {"Content-Type": UNIT_ENCODING, "If-Match": f'"{encoder.digest}"'}
+    assert unpack_unit_encoding(observation.body, 3) == pytest.approx(u / np.linalg.norm(u), abs=0.01)
     assert len(encoder.view(encoding=encoding).body) == 1 + 2
     for n_bits in (1, 9):
         with pytest.raises(errors.InvalidArgumentError, match="2 to 8 bits"):
@@ -149,10 +149,10 @@ def test_models_that_this_version_cannot_rank_by(model):
 
 
 def test_other_weights_and_a_missing_package_are_named(content, model, monkeypatch):
-    there = "5" * 64
-    encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, GRADIENTS, there)))
+    map_sha256 = "5" * 64
+    encoder = OnBoardEncoder(pack_landmarks(PortableLandmarks(model, N_LANDMARKS, 1, GRADIENTS, map_sha256)))
     for encode in (encoder.load_extractor, lambda: encoder.ranks(picture(1))):
-        with pytest.raises(errors.OtherWeightsError, match=f"none.*{there}"):
+        with pytest.raises(errors.OtherWeightsError, match=f"none.*{map_sha256}"):
             encode()
 
     def missing():
@@ -171,14 +171,14 @@ def test_it_is_fetched_for_a_map_and_sent_as_it_is(content):
     with script.client() as client:
         fetched = client.on_board("campus")
         assert client.on_board("campus", map_version=3).digest == fetched.digest
-        seen = fetched.ranks(picture(1))
+        observation = fetched.ranks(picture(1))
         with pytest.raises(errors.LandmarkModelDiffersError, match="map_version=9"):
-            client.localize("campus", on_board=seen)
+            client.localize("campus", on_board=observation)
     base = "http://service/v1/domains/campus/landmark-model"
     assert [str(request.url) for request in script.requests[:2]] == [base, f"{base}?map_version=3"]
-    sent = script.requests[2]
-    assert (sent.headers["content-type"], sent.headers["if-match"]) == (RANKS, f'"{fetched.digest}"')
-    assert sent.content == seen.body
+    third = script.requests[2]
+    assert (third.headers["content-type"], third.headers["if-match"]) == (RANKS, f'"{fetched.digest}"')
+    assert third.content == observation.body
 
 
 HIDDEN = {"fastapi", "starlette", "uvicorn", "sqlite_utils", "prometheus_client", "pydantic_settings"}
@@ -198,5 +198,5 @@ def test_encoding_on_board_needs_nothing_of_the_service_but_core_and_evaluators(
     OnBoardEncoder(content).save(tmp_path / "campus.npz")
     (tmp_path / "view.png").write_bytes(picture(1))
     program = [sys.executable, "-c", CODE.replace("{hidden}", repr(HIDDEN))]
-    ended = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert ended.stdout == "64\n", ended.stderr
+    process = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert process.stdout == "64\n", process.stderr

@@ -1,4 +1,4 @@
-"""What goes over the wire, and what becomes of the answers."""
+"""The requests on the wire, and the reading of the answers."""
 
 import ast
 import itertools
@@ -69,13 +69,13 @@ def test_what_can_never_be_sent_is_refused_here(tmp_path):
             observation(**form)
     with pytest.raises(errors.BrokenFrameError, match=r"no\.jpg"):
         observation(tmp_path / "no.jpg")
-    wrong = {
+    image_of_words = {
         "int": 3,
         "reads text": StringIO("a"),
         r"2, 2, 4": np.zeros((2, 2, 4), np.uint8),
         "float64": np.zeros((2, 2)),
     }
-    for says, image in wrong.items():
+    for says, image in image_of_words.items():
         with pytest.raises(InvalidArgumentError, match=says):
             observation(image)
 
@@ -86,7 +86,7 @@ def test_an_image_may_be_bytes_a_path_an_open_file_or_pixels(tmp_path):
     path = tmp_path / "view.png"
     path.write_bytes(body)
     with path.open("rb") as file:
-        given = [
+        images = [
             body,
             bytearray(body),
             memoryview(body),
@@ -97,7 +97,7 @@ def test_an_image_may_be_bytes_a_path_an_open_file_or_pixels(tmp_path):
             pixels,
             pixels[..., ::1],
         ]
-        views = [observation(image) for image in given]
+        views = [observation(image) for image in images]
     assert {(view.body, view.headers["Content-Type"]) for view in views} == {(body, "image/png")}
     grey = observation(pixels[..., 0])
     assert np.array_equal(cv2.imdecode(np.frombuffer(grey.body, np.uint8), cv2.IMREAD_UNCHANGED), pixels[..., 0])
@@ -156,11 +156,11 @@ def test_address_and_key_from_the_environment(monkeypatch):
     with script.client(None) as client:
         assert client.domains() == ()
     script.client("http://here", "given").domains()
-    bare, environment, given = script.requests
+    bare, environment, explicit = script.requests
     assert "authorization" not in bare.headers
     assert environment.url == "http://elsewhere:81/below/v1/domains?limit=200"
     assert environment.headers["authorization"] == "Bearer from-environment"
-    assert (given.url.host, given.headers["authorization"]) == ("here", "Bearer given")
+    assert (explicit.url.host, explicit.headers["authorization"]) == ("here", "Bearer given")
 
 
 def test_arrays_travel_as_npz_and_npy():
@@ -172,19 +172,19 @@ def test_arrays_travel_as_npz_and_npy():
     client.admin.put_frames("d", "t", encodings=[[1.0], [2.0]], index=[0.0, 5.0], position_m=[0, 1.5])
     assert client.relevances("d", ranked_landmarks=[0]).tolist() == [0.5, -1.0]
     frames, relevances = script.requests
-    with np.load(BytesIO(frames.content)) as sent:
-        assert sorted(sent) == ["encodings", "index", "position_m"]
-        assert sent["encodings"].dtype == np.float32
-        assert sent["index"].dtype == np.int64
-        assert sent["index"].tolist() == [0, 5]
+    with np.load(BytesIO(frames.content)) as arrays:
+        assert sorted(arrays) == ["encodings", "index", "position_m"]
+        assert arrays["encodings"].dtype == np.float32
+        assert arrays["index"].dtype == np.int64
+        assert arrays["index"].tolist() == [0, 5]
     assert frames.headers["content-type"] == relevances.headers["accept"] == "application/octet-stream"
 
 
 def test_an_index_that_is_no_whole_number_is_not_cut_to_one():
     script = Script(answer(200, {"n_new": 1, "n_replaced": 0, "n_frames": 1}))
     script.client().admin.put_frames("d", "t", encodings=[[1.0]], index=[0.5], position_m=[0])
-    with np.load(BytesIO(script.requests[0].content)) as sent:
-        assert sent["index"].tolist() == [0.5], "which the service refuses"
+    with np.load(BytesIO(script.requests[0].content)) as arrays:
+        assert arrays["index"].tolist() == [0.5], "which the service refuses"
 
 
 @pytest.mark.parametrize("content", [b"", b"<html>", b"{}", b"\x93NUMPY\x01\x00"])
@@ -223,23 +223,23 @@ def test_an_unheard_code_falls_back_on_the_status(status):
 
 
 def shelf(request):
-    """Gives out jobs three at a time, whatever length is asked for."""
+    """Answers with pages of three jobs, whatever length is asked for."""
     first = int(request.url.params.get("after", "jobs-0").removeprefix("jobs-"))
-    following = f"jobs-{first + 3}" if first + 3 < len(JOBS) else None
-    return httpx2.Response(200, json={"jobs": JOBS[first : first + 3], "next": following})
+    next_page = f"jobs-{first + 3}" if first + 3 < len(JOBS) else None
+    return httpx2.Response(200, json={"jobs": JOBS[first : first + 3], "next": next_page})
 
 
 def test_a_list_is_read_to_its_end():
-    asked: list[dict[str, str]] = []
+    pages: list[dict[str, str]] = []
 
     def note(request):
-        asked.append(dict(request.url.params))
+        pages.append(dict(request.url.params))
         return shelf(request)
 
     with Client("http://service", transport=httpx2.MockTransport(note)) as client:
         assert [job.job_id for job in client.admin.jobs("d")] == [job["job_id"] for job in JOBS]
-        assert [page.get("after") for page in asked] == [None, "jobs-3", "jobs-6"]
-        assert {page["domain"] for page in asked} == {"d"}
+        assert [page.get("after") for page in pages] == [None, "jobs-3", "jobs-6"]
+        assert {page["domain"] for page in pages} == {"d"}
 
 
 @pytest.mark.parametrize("document", [{"jobs": JOBS[:2]}, {"jobs": JOBS[:2], "next": None}, JOBS[:2]])
@@ -265,8 +265,8 @@ def test_every_answer_knows_its_request_which_the_caller_may_name(is_named):
         answers = [place, session.opened, session.observe(ranked_landmarks=[0]), session.next_best_view()]
         answers.append(client.admin.job("j"))
     assert [reply.request_id for reply in answers if reply is not None] == ["r0", "r1", "r2", "r3", "r4"]
-    sent = [request.headers.get("x-request-id") for request in script.requests]
-    assert sent == [f"robot.{n}" if is_named else None for n in range(5)]
+    ids = [request.headers.get("x-request-id") for request in script.requests]
+    assert ids == [f"robot.{n}" if is_named else None for n in range(5)]
     assert Script(answer(200, JOB)).client().admin.job("j").request_id is None
 
 
@@ -284,12 +284,12 @@ def test_every_try_has_an_id_of_its_own_and_the_error_tells_the_last():
 
 
 def test_a_requests_id_is_no_part_of_what_was_answered():
-    named, unnamed = Localization.model_validate(LOCALIZATION), Localization.model_validate(LOCALIZATION)
-    assert named.answering("r1").request_id == "r1"
-    assert unnamed.request_id is None
-    assert named == unnamed
-    assert named.model_dump() == unnamed.model_dump()
-    assert "r1" not in named.model_dump_json() + repr(named)
+    answer_of_r1, equal_answer = Localization.model_validate(LOCALIZATION), Localization.model_validate(LOCALIZATION)
+    assert answer_of_r1.answering("r1").request_id == "r1"
+    assert equal_answer.request_id is None
+    assert answer_of_r1 == equal_answer
+    assert answer_of_r1.model_dump() == equal_answer.model_dump()
+    assert "r1" not in answer_of_r1.model_dump_json() + repr(answer_of_r1)
     assert Job.model_validate({**JOB, "_request_id": "theirs", "request_id": "theirs"}).request_id is None
 
 
@@ -310,12 +310,12 @@ def test_importing_the_client_needs_httpx2_and_pydantic_alone():
 
 @pytest.mark.parametrize("absent", ["click", "rich", "numpy", "cv2", "matplotlib"])
 def test_the_script_without_the_extra_says_what_to_install(absent):
-    ended = python(
+    process = python(
         f"import sys; sys.modules[{absent!r}] = None; sys.argv = ['', 'domains']\n"
         "from deepsimbad_client.cli import main\nmain()"
     )
-    assert ended.returncode == 1
-    assert ended.stderr == f"{absent} not installed: pip install 'deep-simbad[replay]'\n"
+    assert process.returncode == 1
+    assert process.stderr == f"{absent} not installed: pip install 'deep-simbad[replay]'\n"
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_the_script_without_the_extra_says_what_to_install(absent):
     ],
 )
 def test_a_ctrl_c_while_a_command_is_loaded_is_no_stack(command, loads, says):
-    ended = python(
+    process = python(
         "import signal, sys\n"
         "class CtrlC:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
@@ -334,4 +334,4 @@ def test_a_ctrl_c_while_a_command_is_loaded_is_no_stack(command, loads, says):
         "sys.meta_path.insert(0, CtrlC())\n"
         f"from {command} import main\nmain()"
     )
-    assert (ended.returncode, ended.stderr) == (130, says)
+    assert (process.returncode, process.stderr) == (130, says)

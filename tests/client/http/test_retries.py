@@ -1,4 +1,4 @@
-"""What is sent again, when, and after how long."""
+"""Retries: which requests are sent again, when, and after how long."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime

@@ -18,8 +18,8 @@ def n_sessions(client):
 
 def test_a_session_from_start_to_end(client, views):
     with client.session("route", seed=3, planner="constant:4") as session:
-        for at in range(40, 70, 4):
-            observed = session.observe(encoding=views[at], action_m=np.float32(4))
+        for row in range(40, 70, 4):
+            observed = session.observe(encoding=views[row], action_m=np.float32(4))
         assert abs(observed.belief.mode_m - 68) <= 2
         assert observed.n_observations == 8
         assert observed.belief.off_route < 0.05
@@ -39,11 +39,11 @@ def test_a_session_from_start_to_end(client, views):
         assert masses.sum() == pytest.approx(1, abs=1e-5)
         assert session.state().belief == observed.belief
         assert session.next_best_view() == observed.next_best_view
-        carried = session.set_prior(20.0, 3.0)
-        assert carried.belief.mode_m == 20
-        with client.attach_session(session.session_id) as again:
-            assert (again.opened.belief, again.opened.n_observations) == (carried.belief, 10)
-        assert session.state().belief == carried.belief, "what was attached lives on"
+        carried_state = session.set_prior(20.0, 3.0)
+        assert carried_state.belief.mode_m == 20
+        with client.attach_session(session.session_id) as attached:
+            assert (attached.opened.belief, attached.opened.n_observations) == (carried_state.belief, 10)
+        assert session.state().belief == carried_state.belief, "what was attached lives on"
         with client.attach_session(session.session_id, keep=False):
             pass
         with pytest.raises(errors.EndedSessionError):
@@ -61,11 +61,11 @@ def test_what_travels(client, link, views):
     with client.session("route", 12.5, 3, seed=0, **wishes) as session:
         session.observe(encoding=views[12], action_m=1.5, action_std_m=0.25, shortlist=3, idempotency_key="mine")
         session.observe(encoding=views[12])
-    plain, created, given, bare, _ = link.requests
+    plain, created, full, bare, _ = link.requests
     assert json.loads(plain.content) == {}
     assert json.loads(created.content) == {"start_position_m": 12.5, "start_std_m": 3, "seed": 0, **wishes}
-    assert given.url.query == b"action_m=1.5&action_std_m=0.25&shortlist=3"
-    assert given.headers["idempotency-key"] == "mine"
+    assert full.url.query == b"action_m=1.5&action_std_m=0.25&shortlist=3"
+    assert full.headers["idempotency-key"] == "mine"
     assert bare.url.query == b""
     assert len(bare.headers["idempotency-key"]) >= 16
 
@@ -84,24 +84,24 @@ def test_numbers_may_be_those_of_numpy(client, link, views):
 
 
 def test_an_observation_whose_answer_was_lost_counts_once(client, link, views):
-    lost = iter([False, True, True, False, True, False])
-    link.lose = lambda request: "observations" in request.url.path and next(lost)
+    losses = iter([False, True, True, False, True, False])
+    link.lose = lambda request: "observations" in request.url.path and next(losses)
     with client.session("route") as session:
-        for at in (50, 53, 57):
-            session.observe(encoding=views[at], action_m=3)
+        for row in (50, 53, 57):
+            session.observe(encoding=views[row], action_m=3)
         assert session.state().n_observations == 3
     keys = [request.headers["idempotency-key"] for request in link.requests if "observations" in request.url.path]
     assert (len(keys), len(set(keys))) == (6, 3)
 
 
 def test_what_was_given_up_is_repeated_under_its_key(client, link, views):
-    before = n_sessions(client)
+    n_before = n_sessions(client)
     link.lose = lambda request: True
     with pytest.raises(errors.TransportTimeoutError):
         client.session("route", idempotency_key="mine")
     link.lose = lambda request: False
     with client.session("route", idempotency_key="mine") as session:
-        assert n_sessions(client) == before + 1
+        assert n_sessions(client) == n_before + 1
         link.lose = lambda request: True
         with pytest.raises(errors.TransportTimeoutError):
             session.observe(encoding=views[50], idempotency_key="first")
@@ -113,14 +113,14 @@ def test_what_was_given_up_is_repeated_under_its_key(client, link, views):
 
 
 def test_starts_and_ends_whose_answer_was_lost_begin_and_end_one_session(client, link):
-    before = n_sessions(client)
+    n_before = n_sessions(client)
     for tries in ([True, True, False, True, False], [False, False]):
-        lost = iter(tries)
-        link.lose = lambda request: next(lost)  # noqa: B023
+        losses = iter(tries)
+        link.lose = lambda request: next(losses)  # noqa: B023
         client.session("route").delete()
-        assert next(lost, None) is None
+        assert next(losses, None) is None
         link.lose = lambda request: False
-        assert n_sessions(client) == before
+        assert n_sessions(client) == n_before
 
 
 def test_the_end_of_a_block_hides_no_error_of_its_own(client, link):
@@ -167,8 +167,8 @@ def test_truths_are_told_and_experience_is_fed_back():
         with pytest.raises(errors.InvalidArgumentError):
             refused([float("inf")])
     _, truths, experience = [(request.url.path, json.loads(request.content)) for request in script.requests]
-    sent = {"true_positions_m": plain, "true_map_images": [[0], [], [4, 5]], "first_observation": 2}
-    assert truths == ("/v1/sessions/s/truths", sent)
+    body = {"true_positions_m": plain, "true_map_images": [[0], [], [4, 5]], "first_observation": 2}
+    assert truths == ("/v1/sessions/s/truths", body)
     assert experience == ("/v1/admin/domains/d/experience", {"session_id": "s", "true_positions_m": plain})
 
 
@@ -183,15 +183,15 @@ def test_no_next_best_view():
 def test_many_robots_at_once_on_the_async_client(client, views):
     async def robot(link, start):
         async with await link.session("route", seed=start, planner="constant:5") as session:
-            for at in range(start, start + 30, 5):
-                observed = await session.observe(encoding=views[at], action_m=5)
+            for row in range(start, start + 30, 5):
+                observed = await session.observe(encoding=views[row], action_m=5)
             assert (await session.state()).n_observations == 6
             assert (await session.belief_masses()).argmax() == observed.belief.mode_m
             assert await session.next_best_view() == observed.next_best_view
             assert (await session.set_prior(5, 1)).belief.mode_m == 5
         with pytest.raises(errors.EndedSessionError):
             await link.attach_session(session.session_id)
-        return abs(observed.belief.mode_m - at)
+        return abs(observed.belief.mode_m - row)
 
     async def drive():
         async with AsyncClient(client.url) as link:

@@ -20,7 +20,7 @@ class NcltTree:
 
     @staticmethod
     def tiff(stored):
-        """A TIFF with JPEG inside, as NCLT's are; OpenCV makes one only with strips of a multiple of 8 rows."""
+        """A TIFF with JPEG inside, like NCLT's; OpenCV makes one only with strips of a multiple of 8 rows."""
         flags = [cv2.IMWRITE_TIFF_COMPRESSION, 7, cv2.IMWRITE_TIFF_ROWSPERSTRIP, 16]
         ok, body = cv2.imencode(".tiff", stored, flags)
         assert ok
@@ -28,7 +28,7 @@ class NcltTree:
 
     @staticmethod
     def picture(width=64, height=48):
-        """Lying on its side; upright it is blue above, green at the lower left, red at the lower right."""
+        """A picture on its side; upright it is blue above, green at the lower left, red at the lower right."""
         upright = np.zeros((width, height, 3), np.uint8)
         upright[: width // 2] = (250, 30, 30)
         upright[width // 2 :, : height // 2] = (30, 250, 30)

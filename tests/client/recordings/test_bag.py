@@ -76,10 +76,10 @@ class Bag:
             self.write(topic, name, START_NS + 50_000_000 * k, **fields)
 
     def fixes(self, topic="/fix", seconds=4):
-        """North from Greenwich, without a fix in the first half second and with one of 0, 0."""
+        """Writes fixes north from Greenwich, without a fix in the first half second and with one of 0, 0."""
         for k in range(20 * seconds + 1):
-            at = 51.5 + k / 20 / 111_250, 0.0 if k < 10 else 0.5
-            latitude, longitude = (0.0, 0.0) if k == 40 else at
+            degrees = 51.5 + k / 20 / 111_250, 0.0 if k < 10 else 0.5
+            latitude, longitude = (0.0, 0.0) if k == 40 else degrees
             status = self.type("sensor_msgs/msg/NavSatStatus")(status=-1 if k < 10 else 0, service=1)
             place = {"latitude": latitude, "longitude": longitude, "altitude": 0.0}
             place |= {"position_covariance": np.zeros(9), "position_covariance_type": 0}
@@ -88,34 +88,34 @@ class Bag:
 
 @pytest.fixture
 def bag(tmp_path):
-    """A function that writes a bag of a kind (bag, folder, mcap) with what is told, and gives its SOURCE."""
+    """A function that writes a bag of a kind (bag, folder, mcap) by its parts, and returns its SOURCE."""
 
-    def written(kind, *parts):
+    def write_bag(kind, *parts):
         path = tmp_path / ("drive.bag" if kind == "bag" else kind)
-        made = Bag(path, kind)
-        made.writer.open()
+        drive = Bag(path, kind)
+        drive.writer.open()
         for part in parts:
-            part(made)
-        made.writer.close()
+            part(drive)
+        drive.writer.close()
         if kind == "mcap":
             (inner,) = path.glob("*.mcap")
             shutil.move(inner, tmp_path / "drive.mcap")
             return str(tmp_path / "drive.mcap")
         return f"rosbag:{path}"
 
-    return written
+    return write_bag
 
 
-def images(made):
+def images(drive):
     for k in range(20):
-        made.image(START_NS + 200_000_000 * k)
+        drive.image(START_NS + 200_000_000 * k)
 
 
-def odometry(made):
-    made.poses("/odom", name="nav_msgs/msg/Odometry")
+def odometry(drive):
+    drive.poses("/odom", name="nav_msgs/msg/Odometry")
 
 
-def sent(recording, row=0):
+def sent_pixels(recording, row=0):
     encoded = recording.image(recording.frames[row], None)
     return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
 
@@ -130,7 +130,7 @@ def test_images_are_placed_by_poses_at_the_times_in_their_headers(bag, kind):
     assert (first.x_m, first.y_m, first.heading_rad) == pytest.approx((1, 7, 0.5))
     assert first.name.endswith(f"/front/{START_NS + 1_002_000_000}")
     for row in (3, 0, 4):
-        np.testing.assert_array_equal(sent(recording, row), PICTURE)
+        np.testing.assert_array_equal(sent_pixels(recording, row), PICTURE)
     assert open_source(f"{source}#/front,/pose#:3").frames[2].position_m == pytest.approx(0.4)
 
 
@@ -156,7 +156,7 @@ def test_without_positions_images_are_evenly_spaced(bag):
 
 
 def test_one_of_several_topics_is_named(bag):
-    source = bag("folder", images, lambda made: made.image(START_NS, "/rear"), Bag.poses)
+    source = bag("folder", images, lambda drive: drive.image(START_NS, "/rear"), Bag.poses)
     with pytest.raises(SourceError, match=r"images in several topics: name one of /front, /rear as rosbag:"):
         open_source(source)
     assert len(open_source(f"{source}#/front").frames) == 20
@@ -167,7 +167,7 @@ def test_one_of_several_topics_is_named(bag):
 
 
 @pytest.mark.parametrize(
-    ("encoding", "pixels", "seen"),
+    ("encoding", "pixels", "expected"),
     [
         ("rgb8", PICTURE[:, :, ::-1], PICTURE),
         ("bgra8", np.dstack((PICTURE, PICTURE[:, :, 0])), PICTURE),
@@ -178,32 +178,32 @@ def test_one_of_several_topics_is_named(bag):
         ("bayer_rggb8", np.full((12, 16), 90, np.uint8), np.full((12, 16, 3), 90, np.uint8)),
     ],
 )
-def test_raw_images_of_every_layout_become_bgr(bag, encoding, pixels, seen):
-    recording = open_source(bag("mcap", lambda made: made.image(START_NS, pixels=pixels, encoding=encoding)))
-    np.testing.assert_allclose(sent(recording).astype(int), seen, atol=1)
+def test_raw_images_of_every_layout_become_bgr(bag, encoding, pixels, expected):
+    recording = open_source(bag("mcap", lambda drive: drive.image(START_NS, pixels=pixels, encoding=encoding)))
+    np.testing.assert_allclose(sent_pixels(recording).astype(int), expected, atol=1)
 
 
 def test_a_camera_of_twelve_bits_is_shown_by_the_levels_of_its_recording(bag):
-    def dim_and_bright(made):
-        for k, most in enumerate((1000, 4000)):
-            grey = np.linspace(0, most, 12 * 16).reshape(12, 16).astype(np.uint16)
-            made.image(START_NS + 10**9 * k, pixels=grey, encoding="mono16")
+    def dim_and_bright(drive):
+        for k, peak in enumerate((1000, 4000)):
+            grey = np.linspace(0, peak, 12 * 16).reshape(12, 16).astype(np.uint16)
+            drive.image(START_NS + 10**9 * k, pixels=grey, encoding="mono16")
 
     recording = open_source(bag("mcap", dim_and_bright))
     assert recording.grey_levels == (0, 4095)
-    assert [int(sent(recording, row).max()) for row in (0, 1)] == [62, 250]
-    assert int(sent(recording.shown_by((0, 1023)), 0).max()) == 250
+    assert [int(sent_pixels(recording, row).max()) for row in (0, 1)] == [62, 250]
+    assert int(sent_pixels(recording.shown_by((0, 1023)), 0).max()) == 250
 
 
 def test_a_compressed_image_goes_as_it_is_and_a_broken_one_is_named(bag):
     body = cv2.imencode(".jpg", PICTURE)[1].tobytes()
 
-    def both(made):
-        made.compressed(START_NS, body)
-        made.compressed(START_NS + 1_000, body[:-40])
-        made.image(START_NS, "/raw", encoding="depth")
+    def write_images(drive):
+        drive.compressed(START_NS, body)
+        drive.compressed(START_NS + 1_000, body[:-40])
+        drive.image(START_NS, "/raw", encoding="depth")
 
-    source = bag("folder", both)
+    source = bag("folder", write_images)
     recording = open_source(f"{source}#/front/compressed")
     assert recording.image(recording.frames[0], None).body == body
     with pytest.raises(BrokenFrameError):
@@ -214,31 +214,31 @@ def test_a_compressed_image_goes_as_it_is_and_a_broken_one_is_named(bag):
 
 
 def test_headers_of_one_time_or_of_a_clock_that_was_set_are_told(bag):
-    def stuck(made):
+    def stuck(drive):
         for k in range(20):
-            made.write("/front", IMAGE, START_NS, late_ns=200_000_000 * k, **PIXELS)
+            drive.write("/front", IMAGE, START_NS, late_ns=200_000_000 * k, **PIXELS)
 
     recording = open_source(bag("bag", stuck, Bag.poses))
     assert [frame.position_m for frame in recording.frames] == pytest.approx(np.arange(20) / 5)
     assert "all headers say one time: images have the times at which they were recorded" in recording.remarks
 
-    def set_back(made):
+    def set_back(drive):
         for k in range(20):
             back_ns = 2_000_000_000 * (k >= 10)
-            made.write("/front", IMAGE, START_NS + 200_000_000 * k - back_ns, late_ns=back_ns, **PIXELS)
+            drive.write("/front", IMAGE, START_NS + 200_000_000 * k - back_ns, late_ns=back_ns, **PIXELS)
 
     recording = open_source(bag("mcap", set_back, Bag.poses))
     assert any("says 1.8 s before the image recorded before it" in remark for remark in recording.remarks)
 
 
 def test_images_of_several_sizes_are_told_and_depth_is_no_picture(bag):
-    def several(made):
+    def several(drive):
         for k in range(4):
-            made.image(START_NS + 200_000_000 * k, pixels=PICTURE[: 12 - k % 2])
+            drive.image(START_NS + 200_000_000 * k, pixels=PICTURE[: 12 - k % 2])
             for topic, body in (("/jpeg", cv2.imencode(".jpg", PICTURE[k // 3 :])[1]), ("/depth", b"\0" * 40)):
                 kind = {"format": "16UC1; compressedDepth png" if topic == "/depth" else "jpeg"}
                 data = np.frombuffer(body, np.uint8)
-                made.write(topic, "sensor_msgs/msg/CompressedImage", START_NS + 200_000_000 * k, data=data, **kind)
+                drive.write(topic, "sensor_msgs/msg/CompressedImage", START_NS + 200_000_000 * k, data=data, **kind)
 
     source = bag("folder", several)
     assert "2 of 16 x 12 (" in open_source(f"{source}#/front").remarks[-1]
@@ -260,11 +260,11 @@ def test_what_is_no_bag_is_named(tmp_path, monkeypatch):
 
 
 def test_messages_that_cannot_be_used_are_counted_each_for_its_reason(bag):
-    def broken(made):
+    def broken(drive):
         for topic in ("/front", "/pose"):
             for k in range(2):
-                made.writer.write(made.topics[topic], START_NS + 3_900_000_000 + k, b"\0\1")
-        made.image(START_NS)
+                drive.writer.write(drive.topics[topic], START_NS + 3_900_000_000 + k, b"\0\1")
+        drive.image(START_NS)
 
     recording = open_source(bag("mcap", images, Bag.poses, broken))
     assert recording.left_out == {"unreadable message": 2, "received at the time of another": 1}
@@ -274,7 +274,7 @@ def test_messages_that_cannot_be_used_are_counted_each_for_its_reason(bag):
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 def test_a_bag_damaged_in_its_middle_is_named(bag, kind):
     source = bag(kind, images, Bag.poses)
-    whole, path = open_source(source), Path(source.removeprefix("rosbag:"))
+    recording, path = open_source(source), Path(source.removeprefix("rosbag:"))
     body = bytearray(path.read_bytes())
     body[200 : len(body) // 2] = b"\xff" * (len(body) // 2 - 200)
     path.write_bytes(body)
@@ -285,4 +285,4 @@ def test_a_bag_damaged_in_its_middle_is_named(bag, kind):
     assert len(str(refused.value).splitlines()) == 1
     if kind == "mcap":  # the other's reader holds what it has read
         with pytest.raises(BrokenFrameError, match="is damaged"):
-            whole.image(whole.frames[0], None)
+            recording.image(recording.frames[0], None)

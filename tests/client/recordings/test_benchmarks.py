@@ -1,4 +1,4 @@
-"""Route sets that others measure on, in folders laid out as they are downloaded."""
+"""Public benchmark sets, in folders laid out as they are downloaded."""
 
 import cv2
 import numpy as np

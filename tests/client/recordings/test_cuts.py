@@ -10,7 +10,7 @@ from deepsimbad_client.recordings.sources import check_one_drive, one_turn, thin
 
 
 def loop(n, noise_m=0.0):
-    """A circle of 100 m, a frame a metre."""
+    """A recording of a circle of 100 m, a frame every metre."""
     radius = 100 / (2 * math.pi)
     noise = np.random.default_rng(0).normal(0, noise_m, (n, 2))
     return Recording(
@@ -22,19 +22,19 @@ def loop(n, noise_m=0.0):
     )
 
 
-@pytest.mark.parametrize(("n", "kept"), [(95, 95), (101, 101), (125, 101), (330, 101)])
-def test_a_closed_route_is_driven_once(n, kept):
-    once = one_turn(loop(n))
-    assert len(once.frames) == kept
-    assert bool(once.remarks) == (kept < n)
-    assert abs(len(one_turn(loop(n, noise_m=0.2)).frames) - kept) <= 2
-    assert once.left_out == {}
-    assert once.n_whole == n
+@pytest.mark.parametrize(("n", "n_kept"), [(95, 95), (101, 101), (125, 101), (330, 101)])
+def test_a_closed_route_is_driven_once(n, n_kept):
+    turn = one_turn(loop(n))
+    assert len(turn.frames) == n_kept
+    assert bool(turn.remarks) == (n_kept < n)
+    assert abs(len(one_turn(loop(n, noise_m=0.2)).frames) - n_kept) <= 2
+    assert turn.left_out == {}
+    assert turn.n_whole == n
 
 
 def test_a_way_back_through_the_start_is_no_turn():
-    there = [Frame(k, str(k), float(k), None, float(x), 0.0) for k, x in enumerate([*range(40), *range(40, -40, -1)])]
-    assert len(one_turn(Recording("r", there)).frames) == 120
+    frames = [Frame(k, str(k), float(k), None, float(x), 0.0) for k, x in enumerate([*range(40), *range(40, -40, -1)])]
+    assert len(one_turn(Recording("r", frames)).frames) == 120
     unknown = [dataclasses.replace(frame, x_m=None) for frame in loop(130).frames]
     assert len(one_turn(Recording("r", unknown)).frames) == 130
 
@@ -60,17 +60,17 @@ def test_several_drives_in_one_recording_are_refused_and_a_rest_is_not():
 
 def test_what_is_left_out_is_measured_against_all_frames_not_those_taken():
     recording = dataclasses.replace(loop(95), left_out_names={"lost": list("abc")})
-    few = thinned(recording, None, 10)
-    assert len(few.frames) == 10
-    assert LeftOut(few, allow_missing=False).names == {"lost": list("abc")}
+    sparse = thinned(recording, None, 10)
+    assert len(sparse.frames) == 10
+    assert LeftOut(sparse, allow_missing=False).names == {"lost": list("abc")}
 
 
 def test_names_of_two_kinds_placed_by_their_order_are_two_drives():
     names = [f"{drive}_{k}.png" for drive in ("summer", "winter") for k in range(30)]
-    both = Recording("r", [Frame(k, name, 0.5 * k) for k, name in enumerate(names)])
+    two_drives = Recording("r", [Frame(k, name, 0.5 * k) for k, name in enumerate(names)])
     with pytest.raises(SourceError, match=r"summer_29\.png and winter_0\.png.*#:30 or #30:"):
-        check_one_drive(both)
-    check_one_drive(both.sliced(slice(30, None)))
+        check_one_drive(two_drives)
+    check_one_drive(two_drives.sliced(slice(30, None)))
     with pytest.raises(SourceError, match=r"0_left\.png and 0_right\.png are names of several kinds by turns"):
         check_one_drive(
             Recording("r", [Frame(k, f"{k // 2}_{('left', 'right')[k % 2]}.png", 0.5 * k) for k in range(60)])
@@ -79,8 +79,8 @@ def test_names_of_two_kinds_placed_by_their_order_are_two_drives():
     with pytest.raises(SourceError, match=r"0_l\.png and 1000000000\.5_r\.png are names of several kinds by turns"):
         check_one_drive(Recording("r", timed))
     check_one_drive(Recording("r", [Frame(k, f"part{k // 30}_{k % 30}.png", 0.5 * k) for k in range(60)]))
-    placed = [Frame(k, name, k + 0.1 * (k % 3)) for k, name in enumerate(names)]
-    check_one_drive(Recording("r", placed))
+    frames = [Frame(k, name, k + 0.1 * (k % 3)) for k, name in enumerate(names)]
+    check_one_drive(Recording("r", frames))
 
 
 @pytest.mark.parametrize(
@@ -103,9 +103,9 @@ def test_names_that_count_anew_or_are_of_several_days_are_two_drives(first, seco
     n = 40 if says else 10
     numbers = [*range(959, 999), 999] if first.startswith("0_") else range(n)
     names = [form.format(number) for form in (first, second) for number in numbers]
-    both = Recording("r", [Frame(k, name, 0.5 * k) for k, name in enumerate(names)])
+    two_drives = Recording("r", [Frame(k, name, 0.5 * k) for k, name in enumerate(names)])
     if says is None:
-        check_one_drive(both)
+        check_one_drive(two_drives)
         return
     with pytest.raises(SourceError, match=rf"r: .*{says}.*#:40 or #40:"):
-        check_one_drive(both)
+        check_one_drive(two_drives)

@@ -23,15 +23,15 @@ def positions(folder, *lines):
     (folder / "positions.csv").write_text("\n".join(map(str, lines)) + "\n")
 
 
-def placed(folder):
+def places_of(folder):
     return [(frame.name, frame.position_m) for frame in open_source(str(folder)).frames]
 
 
 def test_the_table_is_found_in_any_letter_case(folder):
     (folder / "Positions.CSV").write_text("position_m\n0\n1\n2\n3\n")
-    assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
+    assert [position_m for _, position_m in places_of(folder)] == [0, 1, 2, 3]
     positions(folder, "position_m", "0", "2", "4", "6")
-    assert [at for _, at in placed(folder)] == [0, 2, 4, 6]
+    assert [position_m for _, position_m in places_of(folder)] == [0, 2, 4, 6]
 
 
 def test_images_come_in_name_order_evenly_spaced(folder):
@@ -64,7 +64,7 @@ def test_images_come_in_name_order_evenly_spaced(folder):
 )
 def test_positions_are_read_in_every_documented_form(folder, lines):
     (folder / "positions.csv").write_text("\n".join(lines), encoding="utf-8")
-    assert placed(folder) == [("8.png", 0.0), ("9.png", 1.5), ("10.png", 4.0), ("11.png", 9.0)]
+    assert places_of(folder) == [("8.png", 0.0), ("9.png", 1.5), ("10.png", 4.0), ("11.png", 9.0)]
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_positions_are_read_in_every_documented_form(folder, lines):
 )
 def test_ground_coordinates_alone_give_the_distance_along_them(folder, lines):
     positions(folder, *lines)
-    assert placed(folder) == [("8.png", 0.0), ("9.png", 5.0), ("10.png", 15.0), ("11.png", 16.0)]
+    assert places_of(folder) == [("8.png", 0.0), ("9.png", 5.0), ("10.png", 15.0), ("11.png", 16.0)]
     frame = open_source(str(folder)).frames[1]
     assert (frame.x_m, frame.y_m) == (3.0, 4.0)
 
@@ -93,12 +93,14 @@ def test_unlisted_images_and_lines_without_an_image_are_counted(folder):
 
 
 def test_a_misspelt_name_is_one_frame_left_out_named_on_each_side(tmp_path):
-    for at in range(21):
-        (tmp_path / f"{at}.png").write_bytes(b"")
-    positions(tmp_path, "name,position_m", *(f"{at}{'x' * (at == 7)}.png,{at}" for at in range(21)))
+    for number in range(21):
+        (tmp_path / f"{number}.png").write_bytes(b"")
+    positions(tmp_path, "name,position_m", *(f"{number}{'x' * (number == 7)}.png,{number}" for number in range(21)))
     sides = {"not in positions.csv": ["7.png"], "in positions.csv without an image": ["7x.png"]}
     assert LeftOut(open_source(str(tmp_path)), allow_missing=False).names == sides
-    positions(tmp_path, "name,position_m", *(f"{at}{'x' * (at in (7, 8))}.png,{at}" for at in range(21)))
+    positions(
+        tmp_path, "name,position_m", *(f"{number}{'x' * (number in (7, 8))}.png,{number}" for number in range(21))
+    )
     with pytest.raises(TooManyLeftOutError, match="10% of the frames"):
         LeftOut(open_source(str(tmp_path)), allow_missing=False)
 
@@ -153,7 +155,7 @@ def test_a_frame_without_a_place_is_left_out_by_name(folder):
 
 def test_a_path_written_on_windows_finds_its_file(folder):
     positions(folder, "name,position_m", *(f"Images\\{n}.PNG,{n}" for n in (8, 9, 10, 11)))
-    assert placed(folder) == [("8.png", 8), ("9.png", 9), ("10.png", 10), ("11.png", 11)]
+    assert places_of(folder) == [("8.png", 8), ("9.png", 9), ("10.png", 10), ("11.png", 11)]
 
 
 def test_falling_positions_are_reversed_when_asked_for(folder):
@@ -175,7 +177,7 @@ def test_falling_positions_are_reversed_when_asked_for(folder):
 )
 def test_units_of_times_are_told_by_their_magnitude(folder, column, unit_us):
     at_us = [1_400_000_000_000_000 + 100_000 * place for place in range(4)]
-    times = [f"{at // unit_us if unit_us >= 1 else at * 1000:.0f}" for at in at_us]
+    times = [f"{time_us // unit_us if unit_us >= 1 else time_us * 1000:.0f}" for time_us in at_us]
     positions(
         folder,
         f"name,position_m,{column}",
@@ -191,7 +193,7 @@ def test_units_of_times_are_told_by_their_magnitude(folder, column, unit_us):
 def test_times_say_how_far_and_in_which_order(folder):
     header = "name,x_m,y_m,timestamp_s"
     positions(folder, header, "8.png,30,0,3", "9.png,0,0,0", "10.png,10,0,1", "11.png,20,0,2")
-    assert placed(folder) == [("9.png", 0), ("10.png", 10), ("11.png", 20), ("8.png", 30)]
+    assert places_of(folder) == [("9.png", 0), ("10.png", 10), ("11.png", 20), ("8.png", 30)]
     assert "order of their times" in open_source(str(folder)).remarks[0]
     positions(folder, header, "8.png,0,0,0", "9.png,10,0,1", "10.png,5735000,619000,2", "11.png,20,0,3")
     recording = open_source(str(folder))
@@ -203,35 +205,35 @@ def test_times_say_how_far_and_in_which_order(folder):
 @pytest.mark.parametrize("column", ["x_m,y_m", "position_m"])
 @pytest.mark.parametrize("ahead", [range(10, 20), range(10), range(12, 14)])
 def test_a_clock_set_on_the_way_leaves_frames_in_the_order_of_names(tmp_path, column, ahead):
-    for at in range(30):
-        (tmp_path / f"{at}.png").write_bytes(b"")
+    for number in range(30):
+        (tmp_path / f"{number}.png").write_bytes(b"")
     y = ",0" * (column == "x_m,y_m")
-    rows = (f"{at}{y},{1_700_000_000 + at + 3600 * (at in ahead)}" for at in range(30))
+    rows = (f"{number}{y},{1_700_000_000 + number + 3600 * (number in ahead)}" for number in range(30))
     positions(tmp_path, f"{column},timestamp_s", *rows)
     recording = open_source(str(tmp_path))
-    assert placed(tmp_path) == [(f"{at}.png", at) for at in range(30)]
+    assert places_of(tmp_path) == [(f"{number}.png", number) for number in range(30)]
     assert {frame.timestamp_us for frame in recording.frames} == {None}
-    after = ahead[-1] + 1
+    next_row = ahead[-1] + 1
     (remark,) = recording.remarks
-    assert f"{after}.png says 3599.0 s before {after - 1}.png" in remark
+    assert f"{next_row}.png says 3599.0 s before {next_row - 1}.png" in remark
     assert "stay in the order of their names, and their times are not used" in remark
 
 
 def test_two_drives_by_turns_are_refused_by_name_and_noise_is_not(tmp_path):
-    for at in range(60):
-        (tmp_path / f"{at}.png").write_bytes(b"")
+    for number in range(60):
+        (tmp_path / f"{number}.png").write_bytes(b"")
     rng = np.random.default_rng(2)
     for turns in (np.arange(60) % 2, rng.integers(0, 2, 60)):
-        positions(tmp_path, "x_m,y_m", *(f"{at},{20 * turn}" for at, turn in enumerate(turns)))
+        positions(tmp_path, "x_m,y_m", *(f"{number},{20 * turn}" for number, turn in enumerate(turns)))
         with pytest.raises(SourceError, match=r"\.png are 2[0-9] m apart: are these several drives by turns"):
             open_source(str(tmp_path))
-    positions(tmp_path, "position_m", *(at // 2 + 50 * (at % 2) for at in range(60)))
+    positions(tmp_path, "position_m", *(number // 2 + 50 * (number % 2) for number in range(60)))
     with pytest.raises(SourceError, match=r"0\.png and 1\.png are 50 m apart: are these several drives by turns"):
         open_source(str(tmp_path))
-    rows = [f"{1_700_000_000 + at / 10},{at},{20 * (at % 2)}" for at in range(90)]
+    rows = [f"{1_700_000_000 + number / 10},{number},{20 * (number % 2)}" for number in range(90)]
     positions(tmp_path, "time_s,x_m,y_m", *rows)
-    for at in range(60):
-        (tmp_path / f"{at}.png").rename(tmp_path / f"{1_700_000_000 + at / 10}.png")
+    for number in range(60):
+        (tmp_path / f"{number}.png").rename(tmp_path / f"{1_700_000_000 + number / 10}.png")
     with pytest.raises(SourceError, match="rows of the positions leap to and fro from 2023-11-14"):
         open_source(str(tmp_path))
     for drive_m in (0, 1):
@@ -241,17 +243,17 @@ def test_two_drives_by_turns_are_refused_by_name_and_noise_is_not(tmp_path):
 
 
 def test_one_wrong_time_among_many_is_left_out_by_name(tmp_path):
-    for at in range(40):
-        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
-    positions(tmp_path, "x_m,y_m,time_s", *(f"{at},0,{at + 1000 * (at == 20)}" for at in range(40)))
+    for number in range(40):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((4, 4), np.uint8))
+    positions(tmp_path, "x_m,y_m,time_s", *(f"{number},0,{number + 1000 * (number == 20)}" for number in range(40)))
     recording = open_source(str(tmp_path))
     assert recording.left_out_names == {"whose time goes back": ["20.png"]}
     assert recording.frames[-1].position_m == 39
 
 
 def test_lines_at_a_rate_of_their_own_are_interpolated_at_the_times_that_names_tell(tmp_path):
-    for at in ("1305031103.05", "1305031103.5", "1305031109.9"):
-        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
+    for time in ("1305031103.05", "1305031103.5", "1305031109.9"):
+        cv2.imwrite(str(tmp_path / f"{time}.png"), np.zeros((4, 4), np.uint8))
     rows = (f"{1_305_031_103_000 + 100 * k},{k},7" for k in range(11))
     positions(tmp_path, "timestamp,x_m,y_m", *rows)
     recording = open_source(str(tmp_path))
@@ -262,10 +264,12 @@ def test_lines_at_a_rate_of_their_own_are_interpolated_at_the_times_that_names_t
 
 def test_clocks_that_differ_are_told(tmp_path):
     times = range(1_305_031_103, 1_305_031_106)
-    for at in times:
-        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
+    for number in times:
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((4, 4), np.uint8))
     positions(
-        tmp_path, "name,position_m,time", *(f"{1_305_031_103 + at},{at},{1_305_034_703 + 1.5 * at}" for at in range(3))
+        tmp_path,
+        "name,position_m,time",
+        *(f"{1_305_031_103 + number},{number},{1_305_034_703 + 1.5 * number}" for number in range(3)),
     )
     (_, remark) = open_source(str(tmp_path)).remarks
     assert "by +3600.000 s at the first frame and +3601.000 s at the last" in remark
@@ -276,12 +280,12 @@ def test_a_small_image_goes_as_it_is_and_a_larger_one_resized_where_that_is_shor
     recording = open_source(str(folder))
     frame = recording.frames[0]
     for input_size in (None, (16, 12), (100, 100), (15, 100)):
-        sent = recording.image(frame, input_size)
-        assert (sent.body, sent.content_type) == ((folder / "8.png").read_bytes(), "image/png")
+        encoded = recording.image(frame, input_size)
+        assert (encoded.body, encoded.content_type) == ((folder / "8.png").read_bytes(), "image/png")
     for input_size in ((9, 12), (12, 9), (4, 4)):
-        sent = recording.image(frame, input_size)
-        assert sent.content_type == "image/png"
-        image = cv2.imdecode(np.frombuffer(sent.body, np.uint8), cv2.IMREAD_COLOR)
+        encoded = recording.image(frame, input_size)
+        assert encoded.content_type == "image/png"
+        image = cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
         assert (image.shape[1], image.shape[0]) == input_size
         assert abs(float(image.mean()) - 8) < 2
 
@@ -290,9 +294,9 @@ def test_a_format_nobody_posts_goes_as_png_without_loss(tmp_path):
     image = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "a.bmp"), image)
     recording = open_source(str(tmp_path))
-    sent = recording.image(recording.frames[0], None)
-    assert sent.content_type == "image/png"
-    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(sent.body, np.uint8), cv2.IMREAD_COLOR), image)
+    encoded = recording.image(recording.frames[0], None)
+    assert encoded.content_type == "image/png"
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR), image)
 
 
 def test_images_of_several_shapes_are_told_by_number_and_name(folder):
@@ -313,8 +317,8 @@ def test_cameras_that_exif_names_and_pictures_that_it_turns(tmp_path):
 
 
 def test_a_broken_image_is_named_when_it_is_read(folder):
-    whole = (folder / "9.png").read_bytes()
-    (folder / "9.png").write_bytes(whole[:-20])
+    body = (folder / "9.png").read_bytes()
+    (folder / "9.png").write_bytes(body[:-20])
     recording = open_source(str(folder))
     with pytest.raises(BrokenFrameError, match=r"9\.png cannot be read: .*its end is missing"):
         recording.image(recording.frames[1], None)
@@ -344,7 +348,7 @@ def test_images_of_a_format_that_is_not_read_are_left_out_by_name(folder):
 def test_what_spreadsheets_write_is_read_or_how_to_save_it_is_said(folder):
     table = folder / "positions.csv"
     table.write_text("position_m\n0\n1\n2\n3\n", encoding="utf-16")
-    assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
+    assert [position_m for _, position_m in places_of(folder)] == [0, 1, 2, 3]
     for body in ("position_m\n0\n".encode("utf-16-le"), "name,position_m\nstraße,0\n".encode("latin-1")):
         table.write_bytes(body)
         with pytest.raises(SourceError, match="save it as CSV in UTF-8"):
@@ -387,9 +391,9 @@ def test_positions_that_all_are_one_and_tables_of_another_name_are_told(folder):
 
 def test_decimal_commas_between_semicolons_are_read(folder):
     (folder / "positions.csv").write_bytes(b"\xef\xbb\xbf" + b"position_m\r\n0\r\n1\r\n2\r\n3\r\n")
-    assert [at for _, at in placed(folder)] == [0, 1, 2, 3]
+    assert [position_m for _, position_m in places_of(folder)] == [0, 1, 2, 3]
     positions(folder, "position_m;x_m", "0,25;1", "1,5;2", "2,75;2", "3;2")
-    assert [at for _, at in placed(folder)] == [0.25, 1.5, 2.75, 3]
+    assert [position_m for _, position_m in places_of(folder)] == [0.25, 1.5, 2.75, 3]
 
 
 @pytest.mark.parametrize("offset_s", [float("nan"), 1e30])
@@ -399,9 +403,9 @@ def test_an_offset_that_is_none_is_refused(folder, offset_s):
 
 
 def test_a_clock_coarser_than_the_frames_leaves_each_its_place(tmp_path):
-    for at in range(40):
-        cv2.imwrite(str(tmp_path / f"{at}.png"), np.zeros((4, 4), np.uint8))
-    positions(tmp_path, "time_s,x_m,y_m", *(f"{1_400_000_000 + at // 5},{at},0" for at in range(40)))
+    for number in range(40):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((4, 4), np.uint8))
+    positions(tmp_path, "time_s,x_m,y_m", *(f"{1_400_000_000 + number // 5},{number},0" for number in range(40)))
     recording = open_source(str(tmp_path))
     assert [frame.position_m for frame in recording.frames] == pytest.approx(range(40))
     assert recording.frames[4].timestamp_us == 1_400_000_000_000_000

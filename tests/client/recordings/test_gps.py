@@ -32,7 +32,7 @@ def pictures(folder, names, **exif_of):
 
 
 def gpx(path, n=60):
-    """A fix a second, 2 m to the north each; the twentieth is nowhere."""
+    """Write a fix a second, each 2 m farther north; the twentieth has no place."""
     points = "".join(
         f'<trkpt lat="{0 if k == 20 else 51 + 2 * k / 111_270}" lon="{0 if k == 20 else 9}">'
         f"<ele>3</ele><time>2011-05-10T12:{38 + (23 + k) // 60}:{(23 + k) % 60:02}Z</time></trkpt>"
@@ -60,10 +60,10 @@ def test_images_with_times_for_names_are_placed_by_the_gpx_beside_them(tmp_path)
 
 
 def test_exif_tells_the_time_where_names_do_not(tmp_path):
-    def taken(place):
+    def exif_times(place):
         return {36867: f"2011:05:10 14:38:{25 + place}", 36881: "+02:00", 37521: "5"} if place else {}
 
-    source = pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(5)], base=taken)
+    source = pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(5)], base=exif_times)
     gpx(tmp_path / "drive" / "track.gpx")
     recording = open_source(source)
     assert recording.left_out_names == {"without a time": ["0.jpg"]}
@@ -115,10 +115,10 @@ def test_exif_places_the_images_that_have_it(tmp_path):
     def gps(place):
         if place == 20:
             return {}
-        along = 51 + (9 if place == 10 else 2 * place / 111_270)  # the tenth is a spike
+        latitude = 51 + (9 if place == 10 else 2 * place / 111_270)  # the tenth is a spike
         if place % 3 == 0:  # without seconds
-            return {1: "n", 2: (51, (along - 51) * 60), 3: "W", 4: (9,), 29: "2011:05:10", 7: (12, 38, place)}
-        return {1: "N", 2: degrees(along), 3: "W", 4: degrees(9), 29: "2011:05:10", 7: (12, 38, place)}
+            return {1: "n", 2: (51, (latitude - 51) * 60), 3: "W", 4: (9,), 29: "2011:05:10", 7: (12, 38, place)}
+        return {1: "N", 2: degrees(latitude), 3: "W", 4: degrees(9), 29: "2011:05:10", 7: (12, 38, place)}
 
     recording = open_source(pictures(tmp_path / "drive", [f"{k}.jpg" for k in range(30)], gps=gps))
     assert recording.left_out_names == {"without a position": ["20.jpg"], "where no robot can have been": ["10.jpg"]}
@@ -146,8 +146,8 @@ def test_a_receiver_that_wanders_while_it_stands_goes_nowhere(tmp_path):
     rng = np.random.default_rng(0)
     wander = np.cumsum(rng.normal(0, 0.05, 600))  # correlated, as a receiver's is: no white noise to tell it by
     wander -= np.linspace(wander[0], wander[-1], 600)
-    along = np.concatenate((np.arange(100.0), 100 + wander, np.arange(100.0, 200)))
-    lines = "".join(f"{51 + metres / 111_270},9,{START + k}\n" for k, metres in enumerate(along))
+    along_m = np.concatenate((np.arange(100.0), 100 + wander, np.arange(100.0, 200)))
+    lines = "".join(f"{51 + metres / 111_270},9,{START + k}\n" for k, metres in enumerate(along_m))
     source = pictures(tmp_path / "drive", [f"{START + k}.png" for k in range(0, 800, 20)])
     (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon,time\n{lines}")
     assert open_source(source).frames[-1].position_m == pytest.approx(180, abs=8)
@@ -168,10 +168,10 @@ def test_heic_is_read_or_its_library_is_named(tmp_path, monkeypatch):
     picture = cv2.resize(np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8), (96, 64))
     Image.fromarray(picture).save(tmp_path / "a.HEIC", format="HEIF", quality=95)
     recording = open_source(str(tmp_path))
-    sent = recording.image(recording.frames[0], None)
-    assert sent.content_type == "image/png"
-    seen = cv2.imdecode(np.frombuffer(sent.body, np.uint8), cv2.IMREAD_COLOR_RGB)
-    assert np.abs(seen.astype(int) - picture).mean() < 8
+    encoded = recording.image(recording.frames[0], None)
+    assert encoded.content_type == "image/png"
+    pixels = cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(pixels.astype(int) - picture).mean() < 8
     monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
     with pytest.raises(MissingExtraError, match=r"deep-simbad\[heic\]"):
         open_source(str(tmp_path))
@@ -179,12 +179,12 @@ def test_heic_is_read_or_its_library_is_named(tmp_path, monkeypatch):
 
 def test_a_receiver_that_wanders_over_minutes_hardly_gets_on_and_circles_are_driven():
     rng = np.random.default_rng(1)
-    along = np.concatenate([np.arange(200), np.full(300, 199), np.arange(199, 400)])
-    wander = rng.normal(0, 2, (2, len(along)))
-    for k in range(1, len(along)):  # correlated over a minute, 2 m
+    along_m = np.concatenate([np.arange(200), np.full(300, 199), np.arange(199, 400)])
+    wander = rng.normal(0, 2, (2, len(along_m)))
+    for k in range(1, len(along_m)):  # correlated over a minute, 2 m
         wander[:, k] = np.exp(-1 / 60) * wander[:, k - 1] + np.sqrt(1 - np.exp(-2 / 60)) * wander[:, k]
-    time_us = np.arange(len(along)) * 1_000_000
-    assert arc_length_m(along + wander[0], wander[1], time_us, GPS_DEADBAND_M)[-1] == pytest.approx(399, abs=20)
+    time_us = np.arange(len(along_m)) * 1_000_000
+    assert arc_length_m(along_m + wander[0], wander[1], time_us, GPS_DEADBAND_M)[-1] == pytest.approx(399, abs=20)
     turn = np.arange(600) / 8
     circles = arc_length_m(8 * np.cos(turn), 8 * np.sin(turn), np.arange(600) * 1_000_000, GPS_DEADBAND_M)
     assert circles[-1] == pytest.approx(599, abs=12)

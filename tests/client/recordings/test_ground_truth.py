@@ -50,9 +50,9 @@ def test_poses_are_interpolated_linearly_and_headings_the_short_way_round(nclt_t
 
 def test_times_outside_and_in_long_gaps_are_marked(nclt_tree):
     t = nclt_tree.start_us
-    rows = [nclt_tree.row(t + at, at / 1e6, 0) for at in (0, 10_000, 3_010_000, 3_500_000)]
+    rows = [nclt_tree.row(t + offset_us, offset_us / 1e6, 0) for offset_us in (0, 10_000, 3_010_000, 3_500_000)]
     truth = read_ground_truth(nclt_tree.truth(rows))
-    asked = np.array([-1, 0, 5_000, 10_000, 10_001, 3_009_999, 3_010_000, 3_200_000, 3_500_000, 3_500_001]) + t
-    poses = truth.at(asked)
+    time_us = np.array([-1, 0, 5_000, 10_000, 10_001, 3_009_999, 3_010_000, 3_200_000, 3_500_000, 3_500_001]) + t
+    poses = truth.at(time_us)
     assert poses.covered.tolist() == [False, *[True] * 8, False]
     assert poses.in_gap.tolist() == [False, False, False, False, True, True, False, False, False, False]

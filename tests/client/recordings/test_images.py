@@ -34,10 +34,10 @@ def strip_tiff(image, keep=1.0):
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".webp"])
 @pytest.mark.parametrize("keep", [0.01, 0.5, 0.9, 0.98])
 def test_a_cut_file_is_refused_not_half_decoded(suffix, keep):
-    whole = encoded(suffix)
-    assert decode(whole, HERE).shape == (40, 60, 3)
+    body = encoded(suffix)
+    assert decode(body, HERE).shape == (40, 60, 3)
     with pytest.raises(BrokenFrameError, match="frame"):
-        decode(whole[: int(len(whole) * keep)], HERE)
+        decode(body[: int(len(body) * keep)], HERE)
 
 
 def test_a_cut_tiff_whose_directory_survived_is_refused():
@@ -48,8 +48,8 @@ def test_a_cut_tiff_whose_directory_survived_is_refused():
 
 
 def test_the_end_of_a_preview_inside_a_jpeg_is_not_its_end():
-    whole, preview = encoded(".jpg"), encoded(".jpg", NOISE[::4, ::4].copy())
-    with_preview = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(preview) + 2) + preview + whole[2:]
+    body, preview = encoded(".jpg"), encoded(".jpg", NOISE[::4, ::4].copy())
+    with_preview = body[:2] + b"\xff\xe1" + struct.pack(">H", len(preview) + 2) + preview + body[2:]
     assert decode(with_preview, HERE).shape == (40, 60, 3)
     with pytest.raises(BrokenFrameError, match="its end is missing"):
         decode(with_preview[:-100], HERE)
@@ -75,8 +75,8 @@ def test_grey_16_bit_and_alpha_become_8_bit_bgr():
     np.testing.assert_array_equal(decode(encoded(".png", with_alpha), HERE), NOISE)
 
 
-@pytest.mark.parametrize(("size", "shown"), [((60, 40), (60, 40)), ((24, 24), (36, 24)), ((30, 40), (60, 40))])
-def test_a_copy_says_which_shape_its_picture_has(size, shown):
+@pytest.mark.parametrize(("size", "picture_shape"), [((60, 40), (60, 40)), ((24, 24), (36, 24)), ((30, 40), (60, 40))])
+def test_a_copy_says_which_shape_its_picture_has(size, picture_shape):
     copy = as_png(NOISE, size).body
     assert decode(copy, HERE).shape == (size[1], size[0], 3)
-    assert picture_size(copy) == shown
+    assert picture_size(copy) == picture_shape

@@ -89,9 +89,9 @@ def test_what_has_no_ground_truth_or_no_file_is_left_out_and_counted(nclt_tree):
 
 def test_a_broken_frame_is_named_when_it_is_read_and_the_others_go_on(nclt_tree):
     utimes = fill(nclt_tree)
-    whole = nclt_tree.tiff(nclt_tree.picture())
+    body = nclt_tree.tiff(nclt_tree.picture())
     nclt_tree.image_file(utimes[0], nclt_tree.tiff(nclt_tree.picture(32, 24)))  # the first does not set the measure
-    nclt_tree.image_file(utimes[3], whole[: len(whole) // 2])
+    nclt_tree.image_file(utimes[3], body[: len(body) // 2])
     nclt_tree.image_file(utimes[4], b"not an image at all")
     nclt_tree.image_file(utimes[6], b"")
     nclt_tree.image_file(utimes[7], cv2.imencode(".tiff", np.zeros((48, 64), np.uint16))[1].tobytes())
@@ -252,16 +252,16 @@ def test_undistorted_copies_that_stand_upright_already_are_not_turned(nclt_tree)
     np.testing.assert_array_equal(recording.upright(recording.frames[0]), upright)
 
 
-def seen(recording):
+def bodies_of(recording):
     return [recording.image(frame, None).body for frame in recording.frames]
 
 
 def test_a_cameras_folder_is_recognised_with_its_poses_and_without(nclt_tree):
     fill(nclt_tree, seconds=1)
     camera = nclt_tree.root / nclt_tree.date / "lb3" / "Cam5"
-    whole, found = open_source(nclt_tree.source), open_source(str(camera))
-    assert found.frames == whole.frames
-    assert found.remarks == [f"NCLT's layout: read as {nclt_tree.source}, camera 5, upright"]
+    recording, camera_recording = open_source(nclt_tree.source), open_source(str(camera))
+    assert camera_recording.frames == recording.frames
+    assert camera_recording.remarks == [f"NCLT's layout: read as {nclt_tree.source}, camera 5, upright"]
     assert open_source(str(camera), rotate=0).remarks[0].endswith("camera 5, turned by 0 degrees")
     with pytest.raises(SourceError, match="no undistortion table"):
         open_source(str(camera), undistortion=nclt_tree.root)
@@ -269,10 +269,10 @@ def test_a_cameras_folder_is_recognised_with_its_poses_and_without(nclt_tree):
     with pytest.raises(SourceError, match="fewer than 2 usable rows"):
         open_source(str(camera))
     shutil.rmtree(nclt_tree.root / "ground_truth")
-    found = open_source(f"{camera}#:")
-    assert "turned upright" in found.remarks[-1]
-    assert seen(found) == seen(whole)
-    assert found.frames[1].timestamp_us == whole.frames[1].timestamp_us
+    camera_recording = open_source(f"{camera}#:")
+    assert "turned upright" in camera_recording.remarks[-1]
+    assert bodies_of(camera_recording) == bodies_of(recording)
+    assert camera_recording.frames[1].timestamp_us == recording.frames[1].timestamp_us
 
 
 def test_nclts_images_anywhere_are_turned_upright_by_name_and_shape(nclt_tree, tmp_path):
@@ -284,9 +284,9 @@ def test_nclts_images_anywhere_are_turned_upright_by_name_and_shape(nclt_tree, t
         cv2.imwrite(str(folder / f"{nclt_tree.start_us + 200_000 * place}.png"), stored)
     recording = open_source(str(folder))
     assert recording.remarks
-    sent = cv2.imdecode(np.frombuffer(seen(recording)[1], np.uint8), cv2.IMREAD_COLOR)
-    assert sent.shape == upright.shape
-    assert np.abs(sent.astype(int) - upright).mean() < 3
+    pixels = cv2.imdecode(np.frombuffer(bodies_of(recording)[1], np.uint8), cv2.IMREAD_COLOR)
+    assert pixels.shape == upright.shape
+    assert np.abs(pixels.astype(int) - upright).mean() < 3
     assert open_source(str(folder), rotate=0).rotate == 0
     for place in range(3):
         (folder / f"{nclt_tree.start_us + 200_000 * place}.png").rename(folder / f"{place}.png")
@@ -298,6 +298,6 @@ def test_a_camera_that_hangs_otherwise_is_turned_as_asked(tmp_path, nclt_tree, d
     image = nclt_tree.picture()
     cv2.imwrite(str(tmp_path / "a.png"), np.rot90(image, degrees // 90))
     recording = open_source(str(tmp_path), rotate=degrees)
-    sent = cv2.imdecode(np.frombuffer(seen(recording)[0], np.uint8), cv2.IMREAD_COLOR)
-    assert sent.shape == image.shape
-    assert np.abs(sent.astype(int) - image).mean() < 3
+    pixels = cv2.imdecode(np.frombuffer(bodies_of(recording)[0], np.uint8), cv2.IMREAD_COLOR)
+    assert pixels.shape == image.shape
+    assert np.abs(pixels.astype(int) - image).mean() < 3

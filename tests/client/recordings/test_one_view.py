@@ -30,7 +30,7 @@ EVALUATOR = {"kind": "feature_l2", "extractor": "gradient_grid"}
 
 
 def scene(seed, size=(320, 240)):
-    """[height, width, 3] with small grains, on which resizing and JPEG have something to do."""
+    """A picture, [height, width, 3] uint8, with grains that resizing and JPEG change."""
     random = np.random.default_rng(seed)
     coarse = random.integers(30, 220, (9, 12, 3), np.uint8)
     grains = random.normal(0, 12, (size[1], size[0], 3))
@@ -49,7 +49,7 @@ SIZES = {"small.jpg": (150, 140), "low.png": (300, 90), "large.jpg": (4000, 3000
 
 
 def file_of(name):
-    """The bytes, made where they are needed: every process of a run imports this module."""
+    """The bytes of a file, made only on demand, since every process of a run imports this module."""
     image = scene(FILES.index(name), SIZES.get(name, (320, 240)))
     if name == "turned.jpg":
         return on_its_side(image)
@@ -59,19 +59,19 @@ def file_of(name):
 
 @pytest.mark.parametrize("name", FILES)
 def test_what_is_sent_encodes_to_the_pixels_of_the_whole_picture(name, tmp_path):
-    (tmp_path / name).write_bytes(whole := file_of(name))
+    (tmp_path / name).write_bytes(body := file_of(name))
     recording, evaluator = open_source(str(tmp_path)), FeatureL2("gradient_grid")
-    pixels = decode_image(whole, LIMIT)
+    pixels = decode_image(body, LIMIT)
     for size in ((128, 128), (224, 224), (130, 97)):
-        sent = recording.image(recording.frames[0], size)
-        assert len(sent.body) <= max(len(whole), 3 * size[0] * size[1])
-        np.testing.assert_array_equal(resized(decode_image(sent.body, LIMIT), size), resized(pixels, size))
-    sent = recording.image(recording.frames[0], evaluator.input_size)
-    np.testing.assert_array_equal(evaluator.prepare(decode_image(sent.body, LIMIT)), evaluator.prepare(pixels))
+        encoded = recording.image(recording.frames[0], size)
+        assert len(encoded.body) <= max(len(body), 3 * size[0] * size[1])
+        np.testing.assert_array_equal(resized(decode_image(encoded.body, LIMIT), size), resized(pixels, size))
+    encoded = recording.image(recording.frames[0], evaluator.input_size)
+    np.testing.assert_array_equal(evaluator.prepare(decode_image(encoded.body, LIMIT)), evaluator.prepare(pixels))
 
 
 def test_whether_a_view_shows_nothing_does_not_hang_on_who_made_it_small():
-    """Grains go when a picture shrinks: judged at full size, the same dark would be a view here and none there."""
+    """Shrinking removes grains: judged at full size, one picture would be a view here and none there."""
     random = np.random.default_rng(1)
     night = np.clip(random.normal(20, 2.0, (480, 640, 3)), 0, 255).astype(np.uint8)
     evaluator = FeatureL2("gradient_grid")
@@ -93,8 +93,8 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
         remap(client, "yard", "t", n_landmarks=8, list_length=4)
         by_python = [client.localize("yard", path) for path in paths]
         bodies = [(looks / path).read_bytes() for path in paths]
-        at, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/jpeg"}
-        by_curl = [httpx2.post(at, content=body, headers=header).json() for body in bodies]
+        address, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/jpeg"}
+        by_curl = [httpx2.post(address, content=body, headers=header).json() for body in bodies]
         eyes = client.on_board("yard")
         by_ranks = [client.localize("yard", on_board=eyes.ranks(path, m=8)) for path in paths]
         capsys.readouterr()
@@ -104,7 +104,7 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
         assert run(["localize", str(looks), "--domain", "yard", "--server", url, "--json"]) == 0
         by_folder = json.loads(capsys.readouterr().out)
     assert run_service(["localize", "yard", *paths, "--data-dir", data_dir, "--json"]) == 0
-    here = json.loads(capsys.readouterr().out)
+    by_service_command = json.loads(capsys.readouterr().out)
     made_here = ["map", "own", "--training", str(drive), "--evaluator", "feature_l2:gradient_grid"]
     assert run_service([*made_here, "--n-landmarks", "8", "--data-dir", data_dir]) == 0
     capsys.readouterr()
@@ -113,7 +113,7 @@ def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
     for number, answer in enumerate(by_python):
         expected = answer.model_dump(mode="json")
         assert expected["belief"]["mode_m"] == 3 * (number + 1), "else nothing is shown"
-        for other in (by_curl, by_command, by_folder, here, by_own_map):
+        for other in (by_curl, by_command, by_folder, by_service_command, by_own_map):
             for part in ("belief", "retrieval", "informative"):
                 assert other[number][part] == expected[part]
         # Eight ranks are less than an encoding: they need not agree on the very best.
@@ -136,7 +136,7 @@ def write_nclt(root, date, n, alpha=1.0):
 
 
 def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path, capsys):
-    """Whoever sends its bytes as they are: it is turned as the map's were, and the answer says so."""
+    """A raw image, whoever sends it, is turned as the map's images were, and the answer says so."""
     write_nclt(tmp_path / "nclt", "2012-01-08", 12)
     looks = write_nclt(tmp_path / "nclt", "2012-02-05", 12, alpha=0.8)
     loose = tmp_path / "loose"
@@ -149,8 +149,8 @@ def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path, capsys):
         answers = {"Python": [client.localize("yard", path).model_dump(mode="json") for path in paths]}
         with client.session("yard") as session:
             in_session = session.observe(paths[0])
-        at, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/tiff"}
-        posted = [httpx2.post(at, content=Path(path).read_bytes(), headers=header).json() for path in paths]
+        address, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/tiff"}
+        posted = [httpx2.post(address, content=Path(path).read_bytes(), headers=header).json() for path in paths]
         commands = {
             "files": ["yard", *paths],
             "drive": ["yard", f"nclt:{tmp_path}/nclt/2012-02-05#2:5"],
@@ -169,13 +169,13 @@ def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path, capsys):
     assert [answer["belief"]["mode_m"] for answer in posted] == pytest.approx([2.2, 3.2, 4.2]), "else nothing is shown"
     for answer in (posted[0], in_session.model_dump()):
         assert any("as NCLT's files do: it was turned by 90 degrees" in warning for warning in answer["warnings"])
-    for route, told in answers.items():
-        for answer, expected in zip(told, posted, strict=True):
+    for route, route_answers in answers.items():
+        for answer, expected in zip(route_answers, posted, strict=True):
             assert (answer["belief"], answer["retrieval"]) == (expected["belief"], expected["retrieval"]), route
 
 
 def deep(seed):
-    """Of a camera of 12 bits on a pedestal, in 16."""
+    """A picture of a 12-bit camera with a pedestal, as uint16."""
     return (2000 + 2 * scene(seed)[..., 1].astype(np.uint16)).astype(np.uint16)
 
 
@@ -220,9 +220,9 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, caps
         with pytest.raises(InvalidInputError, match="black and white"):
             client.admin.create_traverse("yard", "odd", grey_levels=(9, 9))
     assert run_service(["localize", "yard", str(look), "--data-dir", data_dir, "--json"]) == 0
-    (here,) = json.loads(capsys.readouterr().out)
+    (by_service_command,) = json.loads(capsys.readouterr().out)
     assert by_curl["belief"]["mode_m"] == 5
-    for other in (by_command, here):
+    for other in (by_command, by_service_command):
         assert (other["belief"], other["retrieval"]) == (by_curl["belief"], by_curl["retrieval"])
     assert any("another bit depth" in warning for warning in bright.warnings)
     assert not any("bit depth" in warning for warning in [*in_session.warnings, *flat.warnings])

@@ -19,19 +19,19 @@ def recording_of(n):
 
 @given(st.integers(1, 20), bounds, bounds, bounds.filter(lambda step: step != 0))
 def test_a_slice_is_pythons_and_frames_keep_their_places(n, start, stop, step):
-    whole = recording_of(n)
+    recording = recording_of(n)
     text = ":".join("" if bound is None else str(bound) for bound in (start, stop, step))
     place, part = split_slice(f"some/folder#{text}")
     assert place == "some/folder"
     expected = list(range(n))[start:stop:step]
     if not expected:
         with pytest.raises(SourceError, match=f"leaves none of the {n} frames"):
-            whole.sliced(part)
+            recording.sliced(part)
         return
-    picked = whole.sliced(part)
+    picked = recording.sliced(part)
     assert [frame.index for frame in picked.frames] == expected
-    assert [frame.position_m for frame in picked.frames] == [at * 0.7 for at in expected]
-    np.testing.assert_array_equal(picked.encodings, whole.encodings[expected])
+    assert [frame.position_m for frame in picked.frames] == [index * 0.7 for index in expected]
+    np.testing.assert_array_equal(picked.encodings, recording.encodings[expected])
     assert (picked.name, picked.left_out) == ("r", {"lost": 3})
 
 

@@ -35,8 +35,8 @@ def test_a_standing_robot_does_not_crawl_however_its_pose_trembles(tremble_m):
 
 
 def test_a_drive_back_over_its_own_track_goes_on_counting():
-    there = np.linspace(0, 40, 4001)
-    x = np.concatenate((there, there[::-1]))
+    way_out = np.linspace(0, 40, 4001)
+    x = np.concatenate((way_out, way_out[::-1]))
     assert arc_length_m(x, np.zeros_like(x), times(len(x)))[-1] == pytest.approx(80, abs=2 * DEADBAND_M)
 
 
@@ -47,7 +47,7 @@ def test_the_ends_of_a_drive_and_the_sides_of_a_gap_are_not_shifted():
 
 
 def slow_reference(points, deadband):
-    """Walk the definition: the summed anchors before, plus the farthest reached from the present one."""
+    """The definition: the sum up to the present anchor, plus the farthest distance reached from it."""
     anchors, total, out = [0], 0.0, []
     for i, point in enumerate(points):
         reached = [math.dist(points[anchors[-1]], points[j]) for j in range(anchors[-1], i + 1)]
@@ -73,7 +73,7 @@ UTM = np.array([5_735_000.0, 619_000.0])
 
 
 def drive(rng, noise_m, hz):
-    """400 m at a metre a frame with 300 frames of standing in the middle: x, y and times."""
+    """The x, y and times of 400 m at a metre a frame, with 300 frames of standing in the middle."""
     x = np.concatenate((np.arange(200.0), np.full(300, 200.0), np.arange(200.0, 401)))
     x, y = UTM[:, None] + np.stack((x, np.zeros_like(x))) + rng.normal(0, noise_m, (2, len(x)))
     return x, y, None if hz is None else 10**15 + (np.arange(len(x)) * 1_000_000 // hz).astype(np.int64)
@@ -90,13 +90,13 @@ def test_jitter_of_gps_adds_no_length_however_long_the_robot_stands(hz, noise_m,
 
 
 SPIKES = {
-    "one 0,0": ([250], lambda x, y, at: (x.put(at, 0), y.put(at, 0))),
-    "no fix at first": (range(12), lambda x, y, at: (x.put(at, 0), y.put(at, 0))),
-    "no fix for a while": (range(100, 112), lambda x, y, at: (x.put(at, 0), y.put(at, 0))),
-    "80 m aside": ([300], lambda x, y, at: y.put(at, y[at] + 80)),
-    "ever elsewhere": (range(20, 700, 60), lambda x, y, at: y.put(at, y[at] + 15 + np.arange(len(at)))),
-    "aside for two seconds": (range(100, 120), lambda x, y, at: y.put(at, y[at] + 60)),
-    "at the end": ([699, 700], lambda x, y, at: x.put(at, x[at] - 9_999)),
+    "one 0,0": ([250], lambda x, y, rows: (x.put(rows, 0), y.put(rows, 0))),
+    "no fix at first": (range(12), lambda x, y, rows: (x.put(rows, 0), y.put(rows, 0))),
+    "no fix for a while": (range(100, 112), lambda x, y, rows: (x.put(rows, 0), y.put(rows, 0))),
+    "80 m aside": ([300], lambda x, y, rows: y.put(rows, y[rows] + 80)),
+    "ever elsewhere": (range(20, 700, 60), lambda x, y, rows: y.put(rows, y[rows] + 15 + np.arange(len(rows)))),
+    "aside for two seconds": (range(100, 120), lambda x, y, rows: y.put(rows, y[rows] + 60)),
+    "at the end": ([699, 700], lambda x, y, rows: x.put(rows, x[rows] - 9_999)),
 }
 
 
@@ -112,19 +112,19 @@ def test_spikes_alone_are_off_the_track(hz, spikes):
 
 def test_a_robot_that_mostly_stood_may_drive_fast_and_its_receiver_wander():
     rng = np.random.default_rng(1)
-    along = np.concatenate((np.arange(0, 200, 2.0), np.full(3000, 200.0), np.arange(200, 400, 2.0)))  # 20 m/s, 10 Hz
-    wander = rng.normal(0, 1, (2, len(along)))
-    for k in range(1, len(along)):  # correlated over a minute
+    along_m = np.concatenate((np.arange(0, 200, 2.0), np.full(3000, 200.0), np.arange(200, 400, 2.0)))  # 20 m/s, 10 Hz
+    wander = rng.normal(0, 1, (2, len(along_m)))
+    for k in range(1, len(along_m)):  # correlated over a minute
         wander[:, k] = np.exp(-1 / 600) * wander[:, k - 1] + np.sqrt(1 - np.exp(-1 / 300)) * wander[:, k]
-    x, y, time_us = along + wander[0], wander[1], np.arange(len(along)) * 100_000
+    x, y, time_us = along_m + wander[0], wander[1], np.arange(len(along_m)) * 100_000
     assert on_track(x, y, time_us).all()
     assert 390 < arc_length_m(x, y, time_us)[-1] < 415
 
 
 def test_two_drives_by_turns_are_one_and_spikes():
-    along = np.arange(200.0)
-    by_turns = np.where(np.arange(200) % 2, along + 800, along)
-    assert on_track(by_turns, 0 * along, None).sum() == 100
+    along_m = np.arange(200.0)
+    by_turns = np.where(np.arange(200) % 2, along_m + 800, along_m)
+    assert on_track(by_turns, 0 * along_m, None).sum() == 100
 
 
 def test_honest_tracks_have_no_spikes():
@@ -157,9 +157,9 @@ def test_stated_positions_rise_but_for_steps_back_of_centimetres(stated, risen, 
 
 
 def test_a_step_back_within_the_noise_of_all_positions_is_standing():
-    along = np.concatenate((np.arange(100.0), np.full(200, 100.0), np.arange(100.0, 200)))
-    noisy = along + np.random.default_rng(2).normal(0, 0.3, len(along))
+    along_m = np.concatenate((np.arange(100.0), np.full(200, 100.0), np.arange(100.0, 200)))
+    noisy = along_m + np.random.default_rng(2).normal(0, 0.3, len(along_m))
     position_m, usable = rising_m(noisy)
     assert usable.all()
     assert (np.diff(position_m) >= 0).all()
-    assert np.abs(position_m - along).max() < 1.5
+    assert np.abs(position_m - along_m).max() < 1.5

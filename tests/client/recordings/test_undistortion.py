@@ -32,11 +32,11 @@ def test_columns_are_row_col_v_u_in_any_order_under_headers_of_any_wording(table
 def test_a_picture_is_looked_up_with_interpolation(table):
     stored = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     stored[1, 2] = 200
-    seen = read_undistortion(table, 5).apply(stored)[:, :, 0]
+    pixels = read_undistortion(table, 5).apply(stored)[:, :, 0]
     # Pixel (row, col) looks at (row + 1/4, col + 1/2): bilinear weights of the one bright pixel.
-    assert seen[1, 2] == pytest.approx(200 * 0.75 * 0.5, abs=2)
-    assert seen[0, 1] == pytest.approx(200 * 0.25 * 0.5, abs=2)
-    assert seen[3].max() == 0
+    assert pixels[1, 2] == pytest.approx(200 * 0.75 * 0.5, abs=2)
+    assert pixels[0, 1] == pytest.approx(200 * 0.25 * 0.5, abs=2)
+    assert pixels[3].max() == 0
 
 
 @pytest.mark.parametrize(

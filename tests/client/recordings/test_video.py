@@ -12,7 +12,7 @@ from deepsimbad_client.recordings.sources import open_source
 
 
 def filmed(path, codec):
-    """Thirty frames, ten a second; the grey of each is five times its number."""
+    """Write thirty frames, ten a second; the grey of each is five times its number."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 10, (64, 48))
     for number in range(30):
         writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
@@ -38,8 +38,8 @@ def test_a_video_is_its_frames_in_any_order_asked_for(video):
     ]
     for frame in [*recording.frames[::-1], *recording.frames]:
         assert grey(recording, frame) == pytest.approx(5 * int(frame.name[-2:]), abs=2)
-    seen = dict(in_order(lambda frame: grey(recording, frame), recording.frames, 4))
-    assert [round(shade / 20 - 0.75) for shade in seen.values()] == list(range(7))
+    shades = dict(in_order(lambda frame: grey(recording, frame), recording.frames, 4))
+    assert [round(shade / 20 - 0.75) for shade in shades.values()] == list(range(7))
 
 
 def test_frames_are_taken_by_time_or_by_distance(video):
@@ -58,15 +58,17 @@ def test_frames_are_taken_by_time_or_by_distance(video):
         f"time,x_m,y_m\n{at_us},0,0\n{at_us + 1_000_000},0,5\n{at_us + 2_900_000},0,9\n"
     )
     recording = open_source(str(video), time_offset_s=0.5)
-    assert [round(recording.frames[at].position_m, 1) for at in (0, 5)] == [2.5, 5]
-    assert recording.left_out_names["before or after the positions"] == [f"drive.avi/0000{at}" for at in range(25, 30)]
+    assert [round(recording.frames[number].position_m, 1) for number in (0, 5)] == [2.5, 5]
+    assert recording.left_out_names["before or after the positions"] == [
+        f"drive.avi/0000{number}" for number in range(25, 30)
+    ]
     assert "begin together" in recording.remarks[0]
     with pytest.raises(SourceError, match="--every-s"):
         open_source(str(video), every_m=5, every_s=1)
 
 
 def with_times(mp4, entries):
-    """An .mp4 whose frames are shown at other times: its box `stts` made anew, (frames, ticks of each) an entry."""
+    """An .mp4 whose frames are shown at other times: its box `stts` is rebuilt of (frames, ticks of each) entries."""
 
     def boxes(start, end):
         while start < end:
@@ -75,22 +77,24 @@ def with_times(mp4, entries):
             start += size
 
     chain, start, end = [], 0, len(mp4)
-    for wanted in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):
-        chain.append(next((start, size) for kind, start, size in boxes(start, end) if kind == wanted))
+    for box_kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):
+        chain.append(next((start, size) for kind, start, size in boxes(start, end) if kind == box_kind))
         start, end = chain[-1][0] + 8, sum(chain[-1])
     table = b"".join(struct.pack(">II", *entry) for entry in entries)
     box = struct.pack(">I4sII", 16 + len(table), b"stts", 0, len(entries)) + table
     start, size = chain[-1]
-    changed = bytearray(mp4[:start] + box + mp4[start + size :])
+    new_mp4 = bytearray(mp4[:start] + box + mp4[start + size :])
     for outer, outer_size in chain[:-1]:
-        changed[outer : outer + 4] = struct.pack(">I", outer_size + len(box) - size)
-    return bytes(changed)
+        new_mp4[outer : outer + 4] = struct.pack(">I", outer_size + len(box) - size)
+    return bytes(new_mp4)
 
 
 def test_frames_of_a_changing_rate_have_the_times_at_which_they_are_shown(tmp_path):
     path = filmed(tmp_path / "phone.mp4", "mp4v")
     path.write_bytes(with_times(path.read_bytes(), [(10, 1024), (20, 2048)]))  # of 10240 a second
-    path.with_suffix(".CSV").write_text("time_s,x_m,y_m\n" + "".join(f"{at / 10},{at},0\n" for at in range(80)))
+    path.with_suffix(".CSV").write_text(
+        "time_s,x_m,y_m\n" + "".join(f"{number / 10},{number},0\n" for number in range(80))
+    )
     recording = open_source(str(path))
     assert [frame.position_m for frame in recording.frames] == pytest.approx([*range(10), *range(10, 30, 2)])
     assert "the file says that it has 30 frames, and 20 can be decoded" in recording.remarks[-1]  # of three seconds
@@ -98,7 +102,7 @@ def test_frames_of_a_changing_rate_have_the_times_at_which_they_are_shown(tmp_pa
 
 
 def test_lines_for_every_frame_place_them(video):
-    video.with_suffix(".csv").write_text("position_m\n" + "".join(f"{at / 2}\n" for at in range(30)))
+    video.with_suffix(".csv").write_text("position_m\n" + "".join(f"{number / 2}\n" for number in range(30)))
     assert open_source(str(video)).frames[-1].position_m == 14.5
 
 
@@ -109,8 +113,8 @@ def test_a_camera_that_hangs_upside_down_is_turned(video):
 
 
 def test_a_video_cut_short_has_broken_frames_and_none_at_all_is_named(video, capfd):
-    whole = video.read_bytes()
-    video.write_bytes(whole[: len(whole) // 2])
+    body = video.read_bytes()
+    video.write_bytes(body[: len(body) // 2])
     recording = open_source(str(video))
     with pytest.raises(BrokenFrameError, match="no frame 29"):
         recording.image(recording.frames[29], None)
@@ -122,14 +126,14 @@ def test_a_video_cut_short_has_broken_frames_and_none_at_all_is_named(video, cap
 
 def test_a_jump_ahead_keeps_few_frames_at_any_time(video, monkeypatch):
     class Counted(OrderedDict):
-        most = 0
+        n_most = 0
 
         def __setitem__(self, key, value):
             super().__setitem__(key, value)
-            Counted.most = max(Counted.most, len(self))
+            Counted.n_most = max(Counted.n_most, len(self))
 
     monkeypatch.setattr(videos, "N_KEPT", 4)
     recording = open_source(str(video))
     monkeypatch.setattr(recording.decoder, "_images", Counted())
     assert grey(recording, recording.frames[29]) == pytest.approx(145, abs=2)
-    assert Counted.most == 5
+    assert Counted.n_most == 5

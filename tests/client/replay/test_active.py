@@ -23,12 +23,12 @@ def drive(encodings):
 
 
 @pytest.fixture
-def driven(client, drive, tmp_path):
-    def driven(recording=drive, folder="out", **options):
+def drive_actively(client, drive, tmp_path):
+    def drive_actively(recording=drive, folder="out", **options):
         wishes: dict[str, Any] = {"planners": PLANNERS, "episodes": 4, "steps": 5, "concurrency": 2, "seed": 5}
         return active_replay(client, recording, "route", tmp_path / folder, **wishes | options)
 
-    return driven
+    return drive_actively
 
 
 @pytest.fixture
@@ -36,49 +36,51 @@ def stage(client, drive):
     return Stage(client, drive, "route")
 
 
-def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(client, driven, link):
-    replay = driven()
+def test_every_planner_starts_from_the_same_places_and_goes_where_it_is_sent(client, drive_actively, link):
+    replay = drive_actively()
     for value in (lambda episode: episode.steps[0].index, lambda episode: episode.seed):
         default, random, constant = ([value(episode) for episode in episodes] for episodes in replay.episodes.values())
         assert default == random == constant
         assert len(set(default)) > 1
     assert max(episode.steps[0].index for episode in replay.episodes["default"]) + 5 * 10 <= 119
-    begun = [request.url.path for request in link.requests if request.method in {"POST", "DELETE"}]
-    assert begun.count(SESSIONS) == 12
-    assert len([path for path in begun if path.startswith("/v1/sessions/") and path.count("/") == 3]) == 12
+    paths = [request.url.path for request in link.requests if request.method in {"POST", "DELETE"}]
+    assert paths.count(SESSIONS) == 12
+    assert len([path for path in paths if path.startswith("/v1/sessions/") and path.count("/") == 3]) == 12
     for episode in replay.episodes["constant:3"]:
         assert (episode.planner_named, episode.edges_m) == ("constant:3", (0.0, 119.0))
-        first, *moved = episode.steps
+        first, *moves = episode.steps
         assert (first.step, first.commanded_m, first.action_m, first.travelled_m) == (0, None, 0.0, 0.0)
-        assert [step.action_m for step in moved] == [3.0] * 5
-        assert [step.position_m for step in moved] == [first.position_m + 3 * n for n in range(1, 6)]
-        assert [step.travelled_m for step in moved] == [3.0, 6.0, 9.0, 12.0, 15.0]
+        assert [step.action_m for step in moves] == [3.0] * 5
+        assert [step.position_m for step in moves] == [first.position_m + 3 * n for n in range(1, 6)]
+        assert [step.travelled_m for step in moves] == [3.0, 6.0, 9.0, 12.0, 15.0]
         assert {step.next_action_m for step in episode.steps} == {3.0}
 
 
-def test_moves_between_sparse_frames_are_told_as_they_were(driven, drive, link):
+def test_moves_between_sparse_frames_are_told_as_they_were(drive_actively, drive, link):
     every_fourth = drive.sliced(slice(0, None, 4))
-    (episode,) = driven(every_fourth, planners=["constant:7"], episodes=1).episodes["constant:7"]
+    (episode,) = drive_actively(every_fourth, planners=["constant:7"], episodes=1).episodes["constant:7"]
     assert [step.action_m for step in episode.steps[1:]] == [8.0] * 5
     assert {step.commanded_m for step in episode.steps[1:]} == {7.0}
     posted = [request for request in link.requests if request.url.path.endswith("observations")]
     assert [request.url.params.get("action_m") for request in posted[1:]] == ["8.0"] * 5
 
 
-def test_ranks_and_errors_against_a_slow_reference(driven, drive, client, views):
+def test_ranks_and_errors_against_a_slow_reference(drive_actively, drive, client, views):
     views = views + np.random.default_rng(0).normal(0, 2, views.shape).astype(np.float32)
-    (episode,) = driven(replace(drive, encodings=views), planners=["constant:7"], episodes=1).episodes["constant:7"]
+    (episode,) = drive_actively(replace(drive, encodings=views), planners=["constant:7"], episodes=1).episodes[
+        "constant:7"
+    ]
     ranks = []
     with client.session("route", planner="constant:7", seed=episode.seed) as session:
         for step in episode.steps:
             observed = session.observe(encoding=views[step.index], action_m=step.action_m)
-            mass, true = session.belief_masses(), step.index
-            better = sum(mass[other] > mass[true] for other in range(120))
-            tied = sum(mass[other] == mass[true] for other in range(120)) - 1
-            ranks.append(better + tied / 2)
-            assert step.rank == better + tied / 2
+            mass, true_image = session.belief_masses(), step.index
+            n_better = sum(mass[other] > mass[true_image] for other in range(120))
+            n_tied = sum(mass[other] == mass[true_image] for other in range(120)) - 1
+            ranks.append(n_better + n_tied / 2)
+            assert step.rank == n_better + n_tied / 2
             assert step.rank_percent == pytest.approx(100 * step.rank / 120)
-            assert (step.true_map_image, step.error_m) == (true, abs(round(observed.belief.mode_m) - true))
+            assert (step.true_map_image, step.error_m) == (true_image, abs(round(observed.belief.mode_m) - true_image))
             assert sum(step.mass) == pytest.approx(1, abs=1e-3)
     assert max(ranks) > 0, "else nothing is shown"
 
@@ -92,22 +94,22 @@ def essence(replay):
 
 
 @pytest.mark.parametrize("stop_after", [1, 5, 11])
-def test_a_replay_goes_on_where_it_was_stopped(driven, tmp_path, link, stop_after):
-    whole = driven(folder="whole", concurrency=1)
+def test_a_replay_goes_on_where_it_was_stopped(drive_actively, tmp_path, link, stop_after):
+    full_replay = drive_actively(folder="whole", concurrency=1)
 
     def stop(episode, n_done):
         if n_done == stop_after:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        driven(folder="parts", on_progress=stop)
+        drive_actively(folder="parts", on_progress=stop)
     file = tmp_path / "parts" / "episodes.jsonl"
     assert len(file.read_text().splitlines()) == stop_after
     with file.open("ab") as torn:
         torn.write(b'{"planner": "default", "epi')
     heard: list[int] = []
-    resumed = driven(folder="parts", on_progress=lambda _, n_done: heard.append(n_done))
-    assert essence(resumed) == essence(whole)
+    resumed = drive_actively(folder="parts", on_progress=lambda _, n_done: heard.append(n_done))
+    assert essence(resumed) == essence(full_replay)
     assert heard == list(range(1, 13))
     lines = [json.loads(line) for line in (tmp_path / "parts" / "steps.jsonl").read_text().splitlines()]
     assert len(lines) == 12 * 6
@@ -115,20 +117,20 @@ def test_a_replay_goes_on_where_it_was_stopped(driven, tmp_path, link, stop_afte
     assert {line["planner"] for line in lines} == set(PLANNERS)
 
 
-def test_planners_and_episodes_can_be_added(driven, link):
-    driven(planners=["random"], episodes=2)
+def test_planners_and_episodes_can_be_added(drive_actively, link):
+    drive_actively(planners=["random"], episodes=2)
     link.requests.clear()
-    replay = driven(planners=["random", "constant:3"], episodes=3)
+    replay = drive_actively(planners=["random", "constant:3"], episodes=3)
     assert [request.url.path for request in link.requests].count(SESSIONS) == 1 + 3
     assert [len(episodes) for episodes in replay.episodes.values()] == [3, 3]
     with pytest.raises(errors.ReplayError, match="seed 5, now 6"):
-        driven(seed=6)
-    assert len(driven(seed=6, episodes=1, restart=True).episodes["default"]) == 1
+        drive_actively(seed=6)
+    assert len(drive_actively(seed=6, episodes=1, restart=True).episodes["default"]) == 1
 
 
-def test_a_recording_too_short_for_its_moves(driven, drive, client, link):
+def test_a_recording_too_short_for_its_moves(drive_actively, drive, client, link):
     with pytest.raises(errors.ReplayError, match="fewer steps"):
-        driven(drive.sliced(slice(0, 50)))
+        drive_actively(drive.sliced(slice(0, 50)))
     assert SESSIONS not in [request.url.path for request in link.requests]
     stage = Stage(client, drive.sliced(slice(0, 51)), "route")
     assert {stage.start(5, 0, episode)[0] for episode in range(20)} == {0}
@@ -142,35 +144,37 @@ def test_starts_are_uniform_and_do_not_depend_on_how_many_there_are(stage):
     assert rows[:5] != [stage.start(7, 1, episode)[0] for episode in range(5)]
 
 
-def test_frames_that_cannot_be_used_are_passed_over(driven, drive, views, link, monkeypatch):
-    answered = link.handle_request
+def test_frames_that_cannot_be_used_are_passed_over(drive_actively, drive, views, link, monkeypatch):
+    answer = link.handle_request
 
     def refuse_zeros(request):
         is_torn = request.url.path.endswith(("observations", "localizations")) and b":[0.0,0.0," in request.content
-        return httpx2.Response(422, json={"code": "undecodable_image"}) if is_torn else answered(request)
+        return httpx2.Response(422, json={"code": "undecodable_image"}) if is_torn else answer(request)
 
     monkeypatch.setattr(link, "handle_request", refuse_zeros)
     torn = np.where(np.arange(120)[:, None] % 3, views, 0)
-    replay = driven(replace(drive, encodings=torn), planners=["constant:3"], episodes=3)
+    replay = drive_actively(replace(drive, encodings=torn), planners=["constant:3"], episodes=3)
     for episode in replay.episodes["constant:3"]:
         assert all(step.index % 3 for step in episode.steps)
         assert all(step.action_m >= 0 for step in episode.steps)
     with pytest.raises(errors.ReplayError, match="none of the"):
-        driven(replace(drive, encodings=np.zeros_like(views)), folder="none", planners=["constant:3"], episodes=1)
+        drive_actively(
+            replace(drive, encodings=np.zeros_like(views)), folder="none", planners=["constant:3"], episodes=1
+        )
 
 
-def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(driven, link, monkeypatch):
-    answered, changes = link.handle_request, [("next_best_view", None)]
+def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(drive_actively, link, monkeypatch):
+    answer, changes = link.handle_request, [("next_best_view", None)]
 
     def change(request):
-        response = answered(request)
+        response = answer(request)
         if b"map_version" not in response.read():
             return response
         return httpx2.Response(response.status_code, json=response.json() | dict(changes))
 
     monkeypatch.setattr(link, "handle_request", change)
     with pytest.raises(errors.ReplayError, match="training"):
-        driven()
+        drive_actively()
 
     def switch(request):
         if request.url.path.endswith("/observations"):
@@ -180,17 +184,17 @@ def test_without_a_next_best_view_or_with_another_map_there_is_no_replay(driven,
     changes[:] = []
     monkeypatch.setattr(link, "handle_request", switch)
     with pytest.raises(errors.ReplayError, match="changed during the replay"):
-        driven(restart=True)
+        drive_actively(restart=True)
 
 
-def test_an_unknown_planner_is_the_services_to_refuse(driven):
+def test_an_unknown_planner_is_the_services_to_refuse(drive_actively):
     for planner in ("nonsense", "constant:99"):
         with pytest.raises(errors.InvalidInputError):
-            driven(planners=[planner])
+            drive_actively(planners=[planner])
 
 
-def test_of_many_episodes_few_keep_their_whole_belief(driven):
-    episodes = driven(planners=["random"], episodes=12, steps=1).episodes["random"]
+def test_of_many_episodes_few_keep_their_whole_belief(drive_actively):
+    episodes = drive_actively(planners=["random"], episodes=12, steps=1).episodes["random"]
     assert [bool(episode.steps[0].mass) for episode in episodes] == [True] * 10 + [False] * 2
 
 

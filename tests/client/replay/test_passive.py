@@ -17,11 +17,11 @@ from deepsimbad_client.replay import Journal, right_answers
 from deepsimbad_client.replay.passive import Replay, Step, replay
 from deepsimbad_client.replay.report import summarise
 
-from ..conftest import ENCODINGS, mapped
+from ..conftest import ENCODINGS, make_map
 
 
 def slow_ranks(client, recording, tolerance_m):
-    """By the definition, from the answers of another session alone; map image i lies at i metres."""
+    """Ranks by the definition, from the answers of another session; map image i lies at i metres."""
     ranks = []
     with client.session("route") as session:
         last_m = recording.frames[0].position_m
@@ -30,13 +30,13 @@ def slow_ranks(client, recording, tolerance_m):
             answer = session.observe(**recording.view(row, None), action_m=moved_m, shortlist=120)
             last_m = frame.position_m
             values = {place.map_image: place.relevance for place in answer.retrieval}
-            placed = [
+            true_ranks = [
                 sum(other > values[image] for other in values.values())
                 + (sum(other == values[image] for other in values.values()) - 1) / 2
                 for image in values
                 if abs(image - frame.position_m) <= tolerance_m
             ]
-            ranks.append(min(placed))
+            ranks.append(min(true_ranks))
     return ranks
 
 
@@ -49,19 +49,19 @@ def test_one_session_in_order_is_ranked_by_the_service(client, link, encodings, 
     harsh = winter + 0.8 * winter.std() * np.random.default_rng(5).normal(size=winter.shape)
     np.save(tmp_path / "harsh.npy", harsh.astype(np.float32))
     recording = open_source(f"{tmp_path / 'harsh.npy'}#20:63")
-    driven = replay(client, recording, "route", tmp_path, tolerance_m=2)
+    result = replay(client, recording, "route", tmp_path, tolerance_m=2)
     assert max(len(request.content) for request in link.requests) < 4_000
-    assert [step.rank for step in driven.steps] == slow_ranks(client, recording, 2)
-    assert len({step.rank for step in driven.steps}) > 2, "else nothing is shown"
+    assert [step.rank for step in result.steps] == slow_ranks(client, recording, 2)
+    assert len({step.rank for step in result.steps}) > 2, "else nothing is shown"
     with pytest.raises(errors.GoneError):
         client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"])
-    for step in driven.steps:
+    for step in result.steps:
         assert (step.n_true, step.true_route_m, step.forgot) == (5, step.position_m, False)
         assert step.error_m == abs((step.best_map_image or 0) - step.position_m)
         assert step.rank_percent == pytest.approx(100 * (step.rank or 0) / 120)
         assert sum(step.mass) == pytest.approx(1, abs=0.001)
     lines = [json.loads(line) for line in (tmp_path / "steps.jsonl").read_text().splitlines()]
-    assert [line["rank"] for line in lines] == [step.rank for step in driven.steps]
+    assert [line["rank"] for line in lines] == [step.rank for step in result.steps]
     assert "mass" not in lines[0]
 
 
@@ -72,8 +72,8 @@ def n_observations(link):
 @pytest.mark.parametrize("is_written", [True, False], ids=["between two views", "an answer that was not written down"])
 def test_a_replay_goes_on_where_it_was_stopped(client, link, encodings, tmp_path, monkeypatch, is_written):
     recording = open_source(f"{encodings / 'winter.npy'}#20:65")
-    whole = replay(client, recording, "route", tmp_path / "whole", concurrency=3)
-    assert [step.index for step in whole.steps] == list(range(20, 65))
+    full_replay = replay(client, recording, "route", tmp_path / "whole", concurrency=3)
+    assert [step.index for step in full_replay.steps] == list(range(20, 65))
     append = Journal.append
 
     def append_or_stop(journal, document):
@@ -94,10 +94,10 @@ def test_a_replay_goes_on_where_it_was_stopped(client, link, encodings, tmp_path
         on_progress=lambda step, n_done: heard.append((n_done, step.rank)),
     )
     assert n_observations(link) == 45 - (32 if is_written else 31)
-    assert essence(resumed.steps) == essence(whole.steps)
-    assert heard == [(at + 1, step.rank) for at, step in enumerate(whole.steps)]
+    assert essence(resumed.steps) == essence(full_replay.steps)
+    assert heard == [(row + 1, step.rank) for row, step in enumerate(full_replay.steps)]
     link.requests.clear()
-    assert essence(replay(client, recording, "route", tmp_path / "parts").steps) == essence(whole.steps)
+    assert essence(replay(client, recording, "route", tmp_path / "parts").steps) == essence(full_replay.steps)
     assert not n_observations(link), "nothing was left to ask"
 
 
@@ -107,7 +107,7 @@ def test_a_session_or_a_map_that_is_another_meanwhile_is_named(client, encodings
     def stop(step, n_done):
         raise KeyboardInterrupt
 
-    mapped(client, "ended", encodings)
+    make_map(client, "ended", encodings)
     with pytest.raises(KeyboardInterrupt):
         replay(client, recording, "ended", tmp_path, on_progress=stop)
     client.attach_session(json.loads((tmp_path / "replay.json").read_text())["session_id"]).delete()
@@ -121,14 +121,14 @@ def test_a_session_or_a_map_that_is_another_meanwhile_is_named(client, encodings
 
 def test_jumps_and_drives_backwards_begin_anew(client, encodings, tmp_path):
     backwards = open_source(f"{encodings / 'winter.npy'}#30:10:-1")
-    driven = replay(client, backwards, "route", tmp_path / "back")
-    assert [step.forgot for step in driven.steps] == [False] + [True] * 19
-    assert summarise(driven)["recall_at_5"] > 50
+    result = replay(client, backwards, "route", tmp_path / "back")
+    assert [step.forgot for step in result.steps] == [False] + [True] * 19
+    assert summarise(result)["recall_at_5"] > 50
     views = np.load(encodings / "winter.npy")
     frames = tuple(Frame(i, str(i), 3.0 * i) for i in (0, 1, 38))
-    driven = replay(client, Recording("jumping", frames, encodings=views[[0, 3, 114]]), "route", tmp_path / "jump")
-    assert [step.forgot for step in driven.steps] == [False, False, True]
-    assert [step.true_route_m for step in driven.steps] == [0.0, 3.0, 114.0]
+    result = replay(client, Recording("jumping", frames, encodings=views[[0, 3, 114]]), "route", tmp_path / "jump")
+    assert [step.forgot for step in result.steps] == [False, False, True]
+    assert [step.true_route_m for step in result.steps] == [0.0, 3.0, 114.0]
 
 
 def test_a_domain_without_a_map_cannot_be_replayed_against(client, encodings, tmp_path):

@@ -37,12 +37,14 @@ def step(number, rank, action_m, travelled_m):
 
 
 def episode(planner, number, ranks, action_m):
-    steps = tuple(step(at, rank, action_m if at else 0.0, at * action_m) for at, rank in enumerate(ranks))
+    steps = tuple(
+        step(n_moves, rank, action_m if n_moves else 0.0, n_moves * action_m) for n_moves, rank in enumerate(ranks)
+    )
     return Episode(planner, "informed" if planner == "default" else planner, number, number, (0.0, 99.0), steps)
 
 
 def replay_of(**ranks):
-    """Planners' ranks [episode][step]; `default` moves 2 m, the others 5 m."""
+    """A replay of planners' ranks [episode][step]; `default` moves 2 m, the others 5 m."""
     moves = {name: 2.0 if name == "default" else 5.0 for name in ranks}
     episodes = {
         name: [episode(name, number, row, moves[name]) for number, row in enumerate(rows)]
@@ -72,27 +74,27 @@ def test_figures_by_hand(two_planners):
     assert summary["against"]["random"]["anr"] == -3.0
     low, high = summary["against"]["random"]["interval_95"]
     assert low < -3 < high == 0.0
-    ours = summary["by_step"]["default"]
-    assert ours["anr"] == [45.0, 2.0, 2.0]
-    assert ours["error_m"] == [90.0, 4.0, 4.0]
-    assert ours["within_5_m"] == [0.0, 50.0, 100.0]
-    assert ours["within_10_m"] == [0.0, 100.0, 100.0]
-    assert ours["travelled_m"] == [0.0, 2.0, 4.0]
+    by_step = summary["by_step"]["default"]
+    assert by_step["anr"] == [45.0, 2.0, 2.0]
+    assert by_step["error_m"] == [90.0, 4.0, 4.0]
+    assert by_step["within_5_m"] == [0.0, 50.0, 100.0]
+    assert by_step["within_10_m"] == [0.0, 100.0, 100.0]
+    assert by_step["travelled_m"] == [0.0, 2.0, 4.0]
     assert summary["planner_named"] == {"default": "informed", "random": "random"}
     json.dumps(summary, allow_nan=False)
 
 
 def test_intervals_against_a_bootstrap_by_hand():
     rng = np.random.default_rng(3)
-    ours, theirs = rng.normal(0, 1, (30, 4)), rng.normal(0.5, 1, (30, 4))
-    ours[3, 2] = np.nan
+    first, second = rng.normal(0, 1, (30, 4)), rng.normal(0.5, 1, (30, 4))
+    first[3, 2] = np.nan
     drawn = []
     for _ in range(4000):
-        picked = rng.integers(30, size=30)
-        drawn.append(np.nanmean(ours[picked]) - np.nanmean(theirs[picked]))
+        rows = rng.integers(30, size=30)
+        drawn.append(np.nanmean(first[rows]) - np.nanmean(second[rows]))
     expected = np.percentile(drawn, [2.5, 97.5])
-    assert Resampling(30).interval(ours, theirs) == pytest.approx(list(expected), abs=0.03)
-    assert Resampling(30).interval(ours) == Resampling(30).interval(ours)
+    assert Resampling(30).interval(first, second) == pytest.approx(list(expected), abs=0.03)
+    assert Resampling(30).interval(first) == Resampling(30).interval(first)
 
 
 def test_pairing_takes_out_what_the_starts_have_in_common():

@@ -45,25 +45,25 @@ def replayed(client, folder, out, *options):
 
 def messages(path):
     reader = pytest.importorskip("mcap.reader")
-    told = {}
+    by_topic = {}
     with path.open("rb") as file:
         for schema, channel, message in reader.make_reader(file).iter_messages():
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             document = json.loads(message.data)
             assert set(document) <= set(json.loads(schema.data)["properties"])
-            told.setdefault((channel.topic, schema.name), []).append((message.log_time, document))
-    return told
+            by_topic.setdefault((channel.topic, schema.name), []).append((message.log_time, document))
+    return by_topic
 
 
 def test_an_mcap_file_holds_what_foxglove_shows(client, seen_route, tmp_path, capsys):
     pytest.importorskip("mcap")
     path = tmp_path / "new" / "drive.mcap"
     assert replayed(client, seen_route, tmp_path / "out", "--mcap", path) == 0
-    told = messages(path)
-    poses = told["/pose", "foxglove.PoseInFrame"]
+    by_topic = messages(path)
+    poses = by_topic["/pose", "foxglove.PoseInFrame"]
     assert len(poses) == N_FRAMES
     assert [time for time, _ in poses] == sorted({time for time, _ in poses}), "every view has a later time"
-    scenes = [document for _, document in told["/scene", "foxglove.SceneUpdate"]]
+    scenes = [document for _, document in by_topic["/scene", "foxglove.SceneUpdate"]]
     (line,) = scenes[0]["entities"][0]["lines"]
     assert [point["x"] for point in line["points"]] == pytest.approx(40 * np.cos(np.arange(N_FRAMES) / 8), abs=1e-3)
     last = {entity["id"]: entity for entity in scenes[-1]["entities"]}
@@ -72,12 +72,12 @@ def test_an_mcap_file_holds_what_foxglove_shows(client, seen_route, tmp_path, ca
     assert last["next_move"]["texts"][0]["text"]
     final = poses[-1][1]["pose"]["position"]
     assert (final["x"], final["y"]) == pytest.approx((40 * np.cos(11 / 8), 40 * np.sin(11 / 8)), abs=3), "it knows"
-    places = [place for _, place in told["/location", "foxglove.LocationFix"]]
+    places = [place for _, place in by_topic["/location", "foxglove.LocationFix"]]
     assert places[-1]["latitude"] == pytest.approx(42.29 + 40 * np.sin(11 / 8) / 111_077, abs=4e-5)
-    images = [document for _, document in told["/image", "foxglove.CompressedImage"]]
+    images = [document for _, document in by_topic["/image", "foxglove.CompressedImage"]]
     body = base64.b64decode(images[4]["data"])
     assert (images[4]["format"], body) == ("jpeg", (seen_route / "04.jpg").read_bytes())
-    figures = [document for _, document in told["/figures", "deepsimbad.Figures"]]
+    figures = [document for _, document in by_topic["/figures", "deepsimbad.Figures"]]
     assert figures[-1]["entropy_bits"] < figures[0]["entropy_bits"]
     capsys.readouterr()
     assert replayed(client, seen_route, tmp_path / "again", "--mcap", path) == 1
@@ -97,21 +97,21 @@ def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client,
     monkeypatch.setattr(viewers, "show_window", lambda stream, layout: stream.save(path, layout))
     assert replayed(client, seen_route, tmp_path / "out", "--rerun") == 0
     store = chunk.RrdReader(str(path)).store()
-    paths = {str(each) for each in store.schema().entity_paths()}
+    paths = {str(entity) for entity in store.schema().entity_paths()}
     world = {f"/world/{part}" for part in ("route", "belief", "likeliest", "truth", "next_move")}
     assert world | {"/view", "/moves", "/figures/entropy_bits", "/said"} <= paths
-    assert {each.name for each in store.schema().index_columns()} >= {"view", "time"}
+    assert {column.name for column in store.schema().index_columns()} >= {"view", "time"}
     rows = {}
-    for each in store.stream().to_chunks():
-        rows[each.entity_path] = rows.get(each.entity_path, 0) + each.num_rows
+    for piece in store.stream().to_chunks():
+        rows[piece.entity_path] = rows.get(piece.entity_path, 0) + piece.num_rows
     assert {rows[f"/{path}"] for path in ("view", "moves", "world/belief", "world/next_move")} == {N_FRAMES}
 
 
 @pytest.mark.parametrize("option", ["rerun", "mcap"])
 def test_without_the_library_one_line_says_what_to_install(client, seen_route, tmp_path, monkeypatch, capsys, option):
     monkeypatch.setitem(sys.modules, {"rerun": "rerun", "mcap": "mcap.writer"}[option], None)
-    given = ["--rerun"] if option == "rerun" else ["--mcap", tmp_path / "x.mcap"]
-    assert replayed(client, seen_route, tmp_path / "out", *given) == 1
+    options = ["--rerun"] if option == "rerun" else ["--mcap", tmp_path / "x.mcap"]
+    assert replayed(client, seen_route, tmp_path / "out", *options) == 1
     assert capsys.readouterr().err == (
         f"deepsimbad-client: missing_extra: --{option} needs "
         + {"rerun": "Rerun's viewer", "mcap": "the library mcap"}[option]

@@ -15,8 +15,8 @@ from deepsimbad_client.replay.watch import BLOCKS, belief_blocks, resampled, wat
 
 
 def console(*, terminal):
-    written = io.StringIO()
-    return Console(file=written, force_terminal=terminal, width=80, highlight=False, markup=False), written
+    stream = io.StringIO()
+    return Console(file=stream, force_terminal=terminal, width=80, highlight=False, markup=False), stream
 
 
 @pytest.fixture
@@ -27,10 +27,10 @@ def stage(client, encodings):
 @pytest.mark.parametrize("kind", [None, "dumb"])
 def test_where_no_picture_can_move_an_episode_is_a_line_for_each_view(stage, monkeypatch, kind):
     monkeypatch.setenv("TERM", kind or "xterm")
-    shown, written = console(terminal=kind is not None)
+    screen, stream = console(terminal=kind is not None)
     slept: list[float] = []
-    steps = watch_episode(stage, shown, planner="constant:7", steps=4, seed=2, pause_s=0.5, sleep=slept.append)
-    lines = written.getvalue().splitlines()
+    steps = watch_episode(stage, screen, planner="constant:7", steps=4, seed=2, pause_s=0.5, sleep=slept.append)
+    lines = stream.getvalue().splitlines()
     assert len(lines) == len(steps) == 5
     assert lines[0].startswith(f"It looks and sees {steps[0].name}. It is likeliest at ")
     assert "Move 4: it goes 7.0 m (asked: 7 m)" in lines[4]
@@ -40,15 +40,15 @@ def test_where_no_picture_can_move_an_episode_is_a_line_for_each_view(stage, mon
 
 def test_an_episode_on_a_terminal_shows_belief_moves_and_truth(stage, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
-    shown, written = console(terminal=True)
-    steps = watch_episode(stage, shown, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
+    screen, stream = console(terminal=True)
+    steps = watch_episode(stage, screen, planner="default", steps=2, seed=0, pause_s=0, sleep=lambda _: None)
     figures = ("asks for", "m (informed)", "lost", "confident", "may stop", f"{steps[-1].true_route_m:.1f} m")
     for words in ("▲ likeliest", "● truth", "█", *figures):
-        assert words in written.getvalue()
+        assert words in stream.getvalue()
 
 
 def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, views):
-    shown, written = console(terminal=False)
+    screen, stream = console(terminal=False)
     robot = client.session("route", confidence=0.5, keep=True)
     polls = iter(range(100))
 
@@ -59,10 +59,10 @@ def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, 
         if poll == 5:
             robot.delete()
 
-    assert watch_session(client, robot.session_id, shown, every_s=0.1, sleep=meanwhile) == 3
+    assert watch_session(client, robot.session_id, screen, every_s=0.1, sleep=meanwhile) == 3
     with pytest.raises(errors.EndedSessionError):
-        watch_session(client, robot.session_id, shown, every_s=0.1)
-    lines = written.getvalue().splitlines()
+        watch_session(client, robot.session_id, screen, every_s=0.1)
+    lines = stream.getvalue().splitlines()
     assert [line.split()[0] for line in lines] == ["0", "1", "2"]
     assert "asks for" in lines[2]
     assert [", confident" in line for line in lines][::2] == [False, True]
@@ -71,12 +71,12 @@ def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, 
     def stop(seconds):
         raise KeyboardInterrupt
 
-    shown, written = console(terminal=True)
+    screen, stream = console(terminal=True)
     with client.session("route") as watched:
         with pytest.raises(KeyboardInterrupt):
-            watch_session(client, watched.session_id, shown, every_s=0.1, sleep=stop)
+            watch_session(client, watched.session_id, screen, every_s=0.1, sleep=stop)
         assert watched.state().n_observations == 0
-    assert f"route, map 1: session {watched.session_id[:8]}" in written.getvalue()
+    assert f"route, map 1: session {watched.session_id[:8]}" in stream.getvalue()
 
 
 def test_the_command(route, encodings, capsys, monkeypatch):
