@@ -33,7 +33,7 @@ from deepsimbad.jobs.build import encode_recording
 from deepsimbad.jobs.experiments.cache import open_encoding_cache
 from deepsimbad.jobs.experiments.nbv import BLOCK_M
 from deepsimbad.jobs.experiments.truth import read_ground_truth
-from deepsimbad.jobs.experiments.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
+from deepsimbad.jobs.experiments.vpr import DriveViews, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad.jobs.fitting import Fitter, RecordingPictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad_campus.season import PAPER_DATES
@@ -163,7 +163,7 @@ class Trial:
             if self.ground_truth is None
             else read_ground_truth(self.ground_truth, test.index, training.index)
         )
-        progress, views = Progress(vpr_stages(config)), ViewsOf(test, evaluator)
+        progress, views = Progress(vpr_stages(config)), DriveViews(test, evaluator)
         scores = score_maps(config, built, views, [truth], progress, bound=False)[0]
         block = (test.position_m[[each.size > 0 for each in truth]] // BLOCK_M).astype(np.int64)
         return Scored(scores, block, built[DEFAULT_RELEVANCE].fitting)

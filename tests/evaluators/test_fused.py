@@ -13,7 +13,7 @@ from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Lesson
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.fused import Fused
-from deepsimbad.jobs.experiments.vpr import ViewsOf, VprConfig, build_maps, score_maps, vpr_stages
+from deepsimbad.jobs.experiments.vpr import DriveViews, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad.jobs.progress import Progress
 
@@ -57,7 +57,9 @@ def scored(relevance, evaluator, landmarks, training, *tests):
     maps = build_maps(config, Fitter(evaluator), evaluator, landmarks, training)
     truth = true_images_of(training.route(), training.route(), 2.0)
     progress = Progress(vpr_stages(config))
-    scores = [score_maps(config, maps, ViewsOf(test, evaluator), [truth], progress, bound=False)[0] for test in tests]
+    scores = [
+        score_maps(config, maps, DriveViews(test, evaluator), [truth], progress, bound=False)[0] for test in tests
+    ]
     return maps[relevance], [anrs[relevance].anr for anrs in scores]
 
 
@@ -85,7 +87,7 @@ def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better
         _, (own_anr,) = scored(Relevance.COMPOSED, ALONE, *(part(drive, half) for drive in (landmarks, training, test)))
         assert own_anr > 1, "else there is nothing to lose"
         assert whole_anr < half_anr < 1.4 * own_anr
-    view = ViewsOf(halved(test, 0), FUSED).by(composed.map.landmark_model).at(0)
+    view = DriveViews(halved(test, 0), FUSED).by(composed.map.landmark_model).at(0)
     map_statistics = composed.map.live_statistics
     live_statistics = map_statistics.observing(view)
     np.testing.assert_array_equal(

@@ -334,7 +334,7 @@ def _print_passive(passive: PassiveScores) -> None:
     table = Table("in order", *(f"{views} view{'s' if views > 1 else ''}: ANR / R@1" for views in WINDOWS))
     for name, scores in passive.by_window.items():
         table.add_row(name, *(f"{score.anr:.2f} / {score.recall_at[1]:.1f}" for score in scores.values()))
-    whole = passive.whole
+    whole = passive.whole_drive
     print_table(
         table,
         f"filter over the whole drive, after every view: ANR {whole.anr:.2f}, R@1 {whole.recall_at[1]:.1f}",

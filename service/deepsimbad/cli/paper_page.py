@@ -13,7 +13,7 @@ from deepsimbad.cli.terminal import render, write_json
 from deepsimbad.core.planners import DEFAULT_PLANNER, NNQL
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.jobs.experiments.paper import Document
-from deepsimbad.jobs.experiments.paper_report import HOLDS, shown_name
+from deepsimbad.jobs.experiments.paper_report import HOLDS, display_name
 from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, RANKS
 
 # As the paper says them, and ours; and which of the page's colours each has
@@ -40,7 +40,7 @@ def write_report(out: Path, document: Document) -> list[Path]:
     told = {
         **document,
         "methods_shown": METHODS,
-        "shown_name": shown_name,
+        "shown_name": display_name,
         "rows": list(_method_rows(document)),
         "encode_ms": _encode_ms(document),
     }

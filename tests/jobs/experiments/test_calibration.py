@@ -138,7 +138,7 @@ def test_a_move_past_the_end_is_refused_and_changes_nothing(drives, evaluator, l
     views = views_of(measure_drive(drives[2], map_.landmark_model, evaluator))
     course = _Course(algorithm, DrivenByTest(views, drives[2].route(), np.arange(N)), QUICK)
     path_m = np.r_[N - 51 + 5.0 * np.arange(11), N - 1.0][np.newaxis]
-    seen = course.driven(path_m, np.r_[np.full(11, 5.0), N + 30.0], lambda _: None)
+    seen = course.drive_robots(path_m, np.r_[np.full(11, 5.0), N + 30.0], lambda _: None)
     assert seen.is_refused[0].tolist() == [0] * 11 + [1]
     assert seen.near_mode[0, 11] == seen.near_mode[0, 10]
 

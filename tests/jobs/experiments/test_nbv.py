@@ -86,7 +86,7 @@ def shares_of(episodes):
 
 def random_moves(report):
     """The moves that the random planner drew: they depend on the seed alone, not on what is believed."""
-    return np.diff([episode.travelled_m for episode in report.paper["random"]], axis=1, prepend=0)
+    return np.diff([episode.travelled_m for episode in report.paper_episodes["random"]], axis=1, prepend=0)
 
 
 def test_the_papers_set_up_agrees_with_the_slow_reference(drives, report):
@@ -95,12 +95,14 @@ def test_the_papers_set_up_agrees_with_the_slow_reference(drives, report):
         moves = np.full((QUICK.episodes, QUICK.n_steps), action_m)
         expected = slow_paper(rows, QUICK, moves)
         assert expected.mean() > 0.01, "all were found, so nothing was compared"
-        measured = shares_of(report.paper[f"constant_{action_m:g}"])
+        measured = shares_of(report.paper_episodes[f"constant_{action_m:g}"])
         np.testing.assert_allclose(measured, expected, atol=1.01 / 110)
         assert measured.mean() == pytest.approx(expected.mean(), abs=2e-4)
     moves = random_moves(report)
     assert set(np.unique(moves)) == set(QUICK.actions_m)
-    np.testing.assert_allclose(shares_of(report.paper["random"]), slow_paper(rows, QUICK, moves), atol=1.01 / 110)
+    np.testing.assert_allclose(
+        shares_of(report.paper_episodes["random"]), slow_paper(rows, QUICK, moves), atol=1.01 / 110
+    )
 
 
 @pytest.mark.slow
@@ -110,7 +112,8 @@ def test_real_netvlad_in_order_of_what_they_know(real_data, evaluator):
     sources = {role: str(folder / f"{name}.npy") for role, name in zip(roles, ("nr", "nq", "nq2"), strict=True)}
     report = experiment(sources, evaluator, NbvConfig(episodes=150, training_episodes=500))
     mean, paper = (
-        {name: shares_of(episodes).mean() for name, episodes in setup.items()} for setup in (report.ours, report.paper)
+        {name: shares_of(episodes).mean() for name, episodes in setup.items()}
+        for setup in (report.our_episodes, report.paper_episodes)
     )
     assert mean["clairvoyant"] < mean["informed"] < mean["random"]
     assert all(mean[name] < paper[name] for name in mean)
@@ -126,24 +129,24 @@ def test_every_planner_has_the_same_starts(drives, report, evaluator):
     """With one move to choose from, all planners are one."""
     config = replace(QUICK, actions_m=(2.0,), episodes=20)
     only = experiment(drives, evaluator, config)
-    for setup in (only.ours, only.paper):
+    for setup in (only.our_episodes, only.paper_episodes):
         for name, episodes in setup.items():
             np.testing.assert_array_equal(shares_of(episodes), shares_of(setup["constant_2"]), err_msg=name)
     assert set(report.config.actions_m) == {1, 2, 4}, "the other tests are of several moves"
 
 
 def test_the_clairvoyant_is_no_worse_than_any_single_move(report):
-    first = shares_of(report.ours["clairvoyant"])[:, 0]
+    first = shares_of(report.our_episodes["clairvoyant"])[:, 0]
     for action_m in QUICK.actions_m:
-        assert (first <= shares_of(report.ours[f"constant_{action_m:g}"])[:, 0]).all()
+        assert (first <= shares_of(report.our_episodes[f"constant_{action_m:g}"])[:, 0]).all()
 
 
 def test_the_truth_is_the_map_image_nearest_in_metres(drives, evaluator):
     """Part of the mapped drive itself, driven again: frame i of the test is not map image i."""
     config = replace(QUICK, episodes=30, training_episodes=0)
     same = experiment({**drives, "test": drives["training"] + "#31:90:2"}, evaluator, config)
-    assert shares_of(same.ours["constant_4"]).mean() < 0.002
-    assert shares_of(same.paper["constant_4"]).mean() < 0.02
+    assert shares_of(same.our_episodes["constant_4"]).mean() < 0.002
+    assert shares_of(same.paper_episodes["constant_4"]).mean() < 0.02
 
 
 def test_a_test_drive_too_short_is_named(drives, evaluator):
@@ -166,10 +169,10 @@ def test_stages_are_reported_and_the_whole_can_be_cancelled(drives, evaluator):
 
 def test_the_document_tells_what_was_measured(report):
     document = report.as_dict({"training": "here"})
-    for name, episodes in report.ours.items():
+    for name, episodes in report.our_episodes.items():
         shares = shares_of(episodes)
         assert document["anr"][name] == pytest.approx(100 * shares.mean())
-        assert document["anr_paper"][name] == pytest.approx(100 * shares_of(report.paper[name]).mean())
+        assert document["anr_paper"][name] == pytest.approx(100 * shares_of(report.paper_episodes[name]).mean())
         low, high = document["interval_95"][name]
         assert low <= document["anr"][name] <= high
         assert document["anr_by_step"][name] == pytest.approx([100 * shares[:, step].mean() for step in range(4)])

@@ -80,8 +80,8 @@ def test_a_belief_of_one_view_ranks_as_its_relevance_does_and_more_views_help(dr
     of_filter, of_sum = scores.by_window[passive.FILTER], scores.by_window[passive.SUM]
     assert of_filter[1].normalised_ranks.tolist() == of_sum[1].normalised_ranks.tolist()
     assert of_filter[10].anr < 0.5 * of_filter[1].anr
-    assert scores.whole.anr < 0.5 * of_filter[1].anr
-    assert scores.whole.n_queries == of_filter[1].n_queries
+    assert scores.whole_drive.anr < 0.5 * of_filter[1].anr
+    assert scores.whole_drive.n_queries == of_filter[1].n_queries
     assert shares[-1] == 1.0
 
 
@@ -95,4 +95,4 @@ def test_of_a_long_drive_some_windows_are_compared(monkeypatch, evaluator):
     truth = [np.array([frame]) for frame in range(N)]
     scores = passive.drive_in_order(map_, views, own.position_m, np.zeros((N, N)), truth, lambda _: None)
     assert [scores.by_window[passive.FILTER][n].n_queries for n in passive.WINDOWS] == [5, 4, 4, 4, 3]
-    assert scores.whole.n_queries == N
+    assert scores.whole_drive.n_queries == N

@@ -10,7 +10,7 @@ import pytest
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.jobs.build import encode_recording
-from deepsimbad.jobs.experiments.vpr import ViewsOf, VprConfig, build_maps, run_vpr, score_maps, vpr_stages
+from deepsimbad.jobs.experiments.vpr import DriveViews, VprConfig, build_maps, run_vpr, score_maps, vpr_stages
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad.jobs.progress import Progress
 from deepsimbad_client.recordings.sources import open_source
@@ -203,7 +203,7 @@ def scores_of_single_views(sources, evaluator, config):
     """The same experiment's scores by relevance, without the drive in order, which takes most of its time."""
     landmarks, training, test, truth = driven(sources, evaluator, config)
     built = build_maps(config, Fitter(evaluator, None, config.seed), evaluator, landmarks, training)
-    return score_maps(config, built, ViewsOf(test.drive, evaluator), [truth], Progress(vpr_stages(config)))[0]
+    return score_maps(config, built, DriveViews(test.drive, evaluator), [truth], Progress(vpr_stages(config)))[0]
 
 
 # Of 50 map images some tie in exact arithmetic, which float32 sums of several terms break: a half place of one query

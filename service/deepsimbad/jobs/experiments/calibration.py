@@ -26,14 +26,14 @@ from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 
-VIEWS = (1, 2, 3, 5, 10)  # after which coverage is told
+VIEWS = (1, 2, 3, 5, 10)  # after which coverage is reported
 _MOVING = {f"moves of {action_m} m": float(action_m) for action_m in (1, 3, 5, 10)}  # metres a move, by stage
 _N_MOVES = 10
 _MOVE_M = 5.0  # of robots that are tracked, carried, off the route, or misjudge their moves
 _TRACKED_MOVES = 10  # before a robot stands, or is carried
 _STANDING_VIEWS = 150
-_CARRIED_M = 100.0  # at least
-_SEARCHING_VIEWS = 30  # of one that was carried
+_CARRIED_M = 100.0  # how far a robot is carried at least
+_SEARCHING_VIEWS = 30  # of a robot that was carried
 _ODOMETRY = {f"odometry times {factor}": factor for factor in (0.9, 1.1)}  # metres reported a metre driven
 _BESIDE_M = 10.0  # behind the mapped half's end, where another stretch begins
 _STRETCHES = ("off the route", "on the route")
@@ -43,28 +43,28 @@ LEAST_M = 250.0  # of test traverse
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """What is measured, and on how many robots; those that only move start everywhere."""
+    """What is measured, and on how many robots; those that only move start at every frame."""
 
     n_landmarks: int = 300  # r
     list_length: int = 4  # h
     relevance: Relevance = DEFAULT_RELEVANCE
     filter: FilterKind = FilterKind.GRID
     standing: int = 20  # robots that stand, from an unknown start and tracked alike
-    carried: int = 60  # that are carried; and that are off the route, and on it
-    seed: int = 0  # of the starts of these, and of particles
+    carried: int = 60  # robots that are carried; as many are off the route, and on it
+    seed: int = 0  # of their starts, and of particles
     # Whether positions of landmark and training traverse are comparable; None: where both know x, y
     same_route: bool | None = True
 
 
 class Sight(NamedTuple):
-    """A belief after a view against the truth; or arrays [robots, views] of these."""
+    """A belief after a view against the truth; or of many, each field an array [robots, views]."""
 
-    is_covered: Any  # the smallest set of map images that holds 95 % holds the true one
+    is_covered: Any  # whether the smallest set of map images that holds 95 % holds the true one
     set_m: Any  # metres of route that this set takes
     near_mode: Any  # probability that the robot is within 5 m of the mode
-    is_near: Any  # the mode is within 5 m of the truth
+    is_near: Any  # whether the mode is within 5 m of the truth
     off_route: Any  # probability of being lost
-    is_refused: Any  # the move led past the end, and the belief stayed as it was
+    is_refused: Any  # whether the move led past the end, so that the belief stayed as it was
 
 
 @dataclass(frozen=True)
@@ -80,17 +80,17 @@ class CalibrationReport:
         moving = {f"{action_m:g}": self.sights[stage] for stage, action_m in _MOVING.items()}
         odometry = {f"{factor:g}": self.sights[stage] for stage, factor in _ODOMETRY.items()}
         standing, tracked = self.sights["standing"].is_covered, self.sights["tracked, then standing"]
-        held = tracked.is_covered[:, -_STANDING_VIEWS:]
-        stayed = tracked.is_near[tracked.is_near[:, _TRACKED_MOVES] == 1, -1]
-        found = views_until_found(self.sights["carried"].is_near[:, -_SEARCHING_VIEWS:])
+        is_held = tracked.is_covered[:, -_STANDING_VIEWS:]
+        has_stayed = tracked.is_near[tracked.is_near[:, _TRACKED_MOVES] == 1, -1]
+        n_views = views_until_found(self.sights["carried"].is_near[:, -_SEARCHING_VIEWS:])
         return {
             "coverage_95": {a: {str(v): _percent(s.is_covered[:, v - 1]) for v in VIEWS} for a, s in moving.items()},
             "set_m": {a: {str(v): float(s.set_m[:, v - 1].mean()) for v in VIEWS} for a, s in moving.items()},
             "reliability": reliability(list(moving.values())),
             "wrong_when_confident": {move: wrong_when_confident(sight) for move, sight in moving.items()},
-            "standing_coverage_95": {"unknown": _percent(standing), "tracked": _percent(held)},
-            "lost_their_place": _percent(1 - stayed),
-            "carried": {"views_median": float(np.median(found)), "views_95": float(np.quantile(found, 0.95))},
+            "standing_coverage_95": {"unknown": _percent(standing), "tracked": _percent(is_held)},
+            "lost_their_place": _percent(1 - has_stayed),
+            "carried": {"views_median": float(np.median(n_views)), "views_95": float(np.quantile(n_views, 0.95))},
             "off_route": {stage: _percent(self.sights[stage].off_route[:, -1]) for stage in _STRETCHES},
             "odometry_coverage_95": {factor: _percent(sight.is_covered) for factor, sight in odometry.items()},
             "odometry_within_5_m": {factor: _percent(sight.is_near) for factor, sight in odometry.items()},
@@ -105,24 +105,24 @@ def _percent(shares: NDArray[Any]) -> float | None:
 
 
 def reliability(sights: Sequence[Sight]) -> dict[str, list[Any]]:
-    """How often the mode was within 5 m of the truth, by ten equal bins of how probable that was held to be."""
-    held, is_near = (
+    """How often the mode was within 5 m of the truth, by ten equal bins of the probability that the belief gave it."""
+    probability, is_near = (
         np.concatenate([getattr(sight, part).ravel() for sight in sights]) for part in ("near_mode", "is_near")
     )
-    bins = np.minimum((held * _N_BINS).astype(int), _N_BINS - 1)
+    bins = np.minimum((probability * _N_BINS).astype(int), _N_BINS - 1)
     members = [bins == number for number in range(_N_BINS)]
     return {
         "n_views": [int(member.sum()) for member in members],
-        "near_mode": [_percent(held[member]) for member in members],
+        "near_mode": [_percent(probability[member]) for member in members],
         "within_5_m": [_percent(is_near[member]) for member in members],
     }
 
 
 def wrong_when_confident(sight: Sight) -> float:
     """Percent of robots that were more than 5 m off when they first were sure."""
-    sure = sight.near_mode >= DEFAULT_CONFIDENCE
-    first = np.arange(len(sure)), sure.argmax(axis=1)
-    return 100 * float((sure[first] & (sight.is_near[first] == 0)).mean())
+    is_sure = sight.near_mode >= DEFAULT_CONFIDENCE
+    first_view = np.arange(len(is_sure)), is_sure.argmax(axis=1)
+    return 100 * float((is_sure[first_view] & (sight.is_near[first_view] == 0)).mean())
 
 
 def views_until_found(is_near: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -131,7 +131,7 @@ def views_until_found(is_near: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def smallest_set(mass: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[n] whether an image is in the smallest set that holds 95 %; with its last one all that tie with it."""
+    """[n] whether an image is in the smallest set that holds 95 % of the mass; all that tie with its last are."""
     descending = np.sort(mass)[::-1]
     n_before = (np.cumsum(descending) < 0.95 * mass.sum() * (1 - 1e-12)).sum()
     return np.asarray(mass >= descending[n_before])
@@ -155,7 +155,7 @@ def run_calibration(
     """Map the training traverse, and drive robots along the test traverse.
 
     Args:
-        pictures: Of the landmark traverse, for evaluators that are fitted to images.
+        pictures: Images of the landmark traverse, for evaluators that are fitted to them.
 
     Raises:
         InvalidMapConfigError: The test traverse is too short.
@@ -165,25 +165,28 @@ def run_calibration(
     fitter = Fitter(evaluator, pictures, config.seed)
     progress.stage("map")
     plan = MapPlan(config.relevance, config.list_length, tuple(_MOVING.values()), same_route=config.same_route)
-    built = build(plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update, fitter=fitter)
+    map_build = build(
+        plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update, fitter=fitter
+    )
     true_image = nearest_images(test, training)
-    course, sights = _course(config, evaluator, built, test, true_image), {}
+    course, sights = _course(config, evaluator, map_build, test, true_image), {}
     for stage, (path_m, moved_m) in _paths(course).items():
         progress.stage(stage)
-        sights[stage] = course.driven(path_m, moved_m, progress.update)
+        sights[stage] = course.drive_robots(path_m, moved_m, progress.update)
     # A map of the first half alone, for robots on it and on the other
     middle_m = float(training.position_m[0] + training.position_m[-1]) / 2
-    mapped = training.at(np.flatnonzero(training.position_m <= middle_m))
-    known = landmarks.at(np.flatnonzero((landmarks.position_m <= middle_m) | (config.same_route is False)))
-    built_half = build(plan, mapped, known, known, min(config.n_landmarks, known.n_frames), evaluator, fitter=fitter)
+    half_training = training.at(np.flatnonzero(training.position_m <= middle_m))
+    half_landmarks = landmarks.at(np.flatnonzero((landmarks.position_m <= middle_m) | (config.same_route is False)))
+    n_landmarks = min(config.n_landmarks, half_landmarks.n_frames)
+    half_build = build(plan, half_training, half_landmarks, half_landmarks, n_landmarks, evaluator, fitter=fitter)
     at_m, ahead_m = training.position_m[true_image], _MOVE_M * np.arange(VIEWS[-1])
     for stage, is_there in zip(_STRETCHES, (at_m > middle_m + _BESIDE_M, at_m <= middle_m), strict=True):
         progress.stage(stage)
         stretch = test.at(np.flatnonzero(is_there))
-        course = _course(config, evaluator, built_half, stretch, nearest_images(stretch, mapped))
+        course = _course(config, evaluator, half_build, stretch, nearest_images(stretch, half_training))
         there_m = course.starts_m(ahead_m[-1], config.carried) + ahead_m
-        sights[stage] = course.driven(there_m, np.full(ahead_m.size, _MOVE_M), progress.update)
-    return CalibrationReport(config, sights, built.same_route)
+        sights[stage] = course.drive_robots(there_m, np.full(ahead_m.size, _MOVE_M), progress.update)
+    return CalibrationReport(config, sights, map_build.same_route)
 
 
 @dataclass(frozen=True)
@@ -195,13 +198,13 @@ class _Course:
     config: CalibrationConfig
 
     def starts_m(self, travel_m: float, count: int | None = None) -> NDArray[np.float64]:
-        """[robots, 1] positions from which so many metres fit: all of them, or some drawn."""
+        """[robots, 1] positions, as `TestDrive.starts`."""
         return self.drive.route.position_m[self.drive.starts(travel_m, count, self.config.seed)][:, np.newaxis]
 
-    def driven(
+    def drive_robots(
         self, path_m: NDArray[np.float64], moved_m: NDArray[np.float64], on_progress: Callable[[float], None]
     ) -> Sight:
-        """What robots believe at true positions [robots, views], reporting moves [views]; the first is unheeded."""
+        """Drive robots along true positions [robots, views], which report moves [views], the first of them unheeded."""
         sights = []
         for number, frames in enumerate(self.drive.route.nearest_image(path_m).tolist()):
             state, robot = self.localizer.start(), []
@@ -218,12 +221,12 @@ class _Course:
 
 
 def _course(
-    config: CalibrationConfig, evaluator: Evaluator, built: Built, test: Drive, true_image: NDArray[np.int64]
+    config: CalibrationConfig, evaluator: Evaluator, map_build: Built, test: Drive, true_image: NDArray[np.int64]
 ) -> _Course:
     # Nobody follows its plans, and a constant planner's cost nothing.
-    used = LocalizerConfig(filter=config.filter, planner=f"{CONSTANT}:{_MOVE_M:g}", seed=config.seed)
-    views = views_of(measure_drive(test, built.map.landmark_model, evaluator))
-    return _Course(ActiveLocalizer(built.map, used), TestDrive(views, test.route(), true_image), config)
+    localizer_config = LocalizerConfig(filter=config.filter, planner=f"{CONSTANT}:{_MOVE_M:g}", seed=config.seed)
+    views = views_of(measure_drive(test, map_build.map.landmark_model, evaluator))
+    return _Course(ActiveLocalizer(map_build.map, localizer_config), TestDrive(views, test.route(), true_image), config)
 
 
 def _sight(belief: BeliefFilter, truth: int, is_refused: bool) -> Sight:

@@ -47,9 +47,9 @@ class TestDrive:
     true_image: NDArray[np.int64]  # [m] int64, the map image nearest to every test frame
 
     def starts(self, travel_m: float, count: int | None, seed: int) -> NDArray[np.int64]:
-        """Frames from which so many metres fit: all of them, or some drawn."""
-        fitting = np.flatnonzero(self.route.position_m + travel_m <= self.route.position_m[-1])
-        return fitting if count is None or not fitting.size else np.random.default_rng(seed).choice(fitting, count)
+        """Frames from which `travel_m` fit: all of them, or `count` drawn with replacement."""
+        frames = np.flatnonzero(self.route.position_m + travel_m <= self.route.position_m[-1])
+        return frames if count is None or not frames.size else np.random.default_rng(seed).choice(frames, count)
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ class Episode:
 
     rank_share: NDArray[np.float64]  # [steps] share of map images placed before the truth after each move
     travelled_m: NDArray[np.float64]  # [steps] metres moved until then
-    views: float  # until it was sure; a sure mistake and never being sure count 20 more
+    views: float  # until the robot was sure of its place; 20 more where it was wrong, or never sure
     metres: float  # moved by then
-    is_wrong: bool  # it was sure, and more than 5 m off
+    is_wrong: bool  # whether it was sure, and more than 5 m off
 
 
 Chooser: TypeAlias = Callable[[int, Step, float], float]
@@ -74,17 +74,17 @@ class EpisodeRunner:
     localizer: ActiveLocalizer  # the algorithm on a map
     drive: TestDrive  # the test traverse
     n_steps: int  # moves an episode
-    action_std_m: float | None = None  # how far the filter trusts a move; None: as usual
-    until_sure: bool = True  # go on after so many moves, to 20, while it is not sure
+    action_std_m: float | None = None  # the error that the filter expects of a move; None: its own default
+    until_sure: bool = True  # whether episodes go on, to 20 moves, while the robot is not sure
 
     def run(self, episode: int, start: int, choose: Chooser) -> Episode:
-        """One episode from a test frame; on to 20 moves where it is not sure before, while the drive lasts."""
+        """Run one episode from a test frame; it goes on to 20 moves where it is not sure, while the drive lasts."""
         shares, travelled = np.empty(self.n_steps), np.empty(self.n_steps)
         route, position_m = self.drive.route, float(self.drive.route.position_m[start])
         step = self.localizer.step(self.localizer.start(), self.drive.views.at(start))
-        moved_m, sure = 0.0, self._sure(step, position_m, 1, 0.0)
+        moved_m, certainty = 0.0, self._certainty(step, position_m, 1, 0.0)
         for number in range(max(self.n_steps, MOST_MOVES) if self.until_sure else self.n_steps):
-            if number >= self.n_steps and sure is not None:
+            if number >= self.n_steps and certainty is not None:
                 break
             action_m = choose(episode, step, position_m)
             if number >= self.n_steps and not route.start_m <= position_m + action_m <= route.position_m[-1]:
@@ -93,13 +93,13 @@ class EpisodeRunner:
             step, share = self.observe(step.state, position_m, action_m)
             if number < self.n_steps:
                 shares[number], travelled[number] = share, moved_m
-            sure = sure or self._sure(step, position_m, number + 2, moved_m)
-        views, metres, is_wrong = sure or (MOST_MOVES + 1, moved_m, False)
-        late = PENALTY_VIEWS if is_wrong or sure is None else 0
-        return Episode(shares, travelled, float(views + late), metres, is_wrong)
+            certainty = certainty or self._certainty(step, position_m, number + 2, moved_m)
+        views, metres, is_wrong = certainty or (MOST_MOVES + 1, moved_m, False)
+        penalty_views = PENALTY_VIEWS if is_wrong or certainty is None else 0
+        return Episode(shares, travelled, float(views + penalty_views), metres, is_wrong)
 
-    def _sure(self, step: Step, position_m: float, views: int, metres: float) -> tuple[int, float, bool] | None:
-        """Views, metres, and whether it is mistaken, of a robot that is sure of its place; None where it is not."""
+    def _certainty(self, step: Step, position_m: float, views: int, metres: float) -> tuple[int, float, bool] | None:
+        """`views`, `metres` and whether a robot that is sure of its place is wrong; None where it is not sure."""
         belief = step.state.belief
         mass, route = belief.mass, belief.route
         mode = int(mass.argmax())
@@ -126,7 +126,7 @@ def follow_plan(episode: int, step: Step, position_m: float) -> float:  # noqa: 
 
 
 def random_chooser(actions_m: NDArray[np.float64], seed: int) -> Chooser:
-    """Any move alike, drawn from the seed, the episode's number and the step's."""
+    """Draws moves uniformly, by the seed, the episode's number and the step's."""
 
     def choose(episode: int, step: Step, position_m: float) -> float:  # noqa: ARG001
         return float(np.random.default_rng([seed, episode, step.state.n_observations]).choice(actions_m))
@@ -150,7 +150,7 @@ class NbvConfig:
 
     n_landmarks: int = 300  # r
     list_length: int = 4  # h
-    relevance: Relevance = DEFAULT_RELEVANCE  # of our set-up, as update; the paper's is measured beside it
+    relevance: Relevance = DEFAULT_RELEVANCE  # of our set-up, as `update`; the paper's is measured beside it
     update: UpdateRule = DEFAULT_UPDATE[DEFAULT_RELEVANCE]
     actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))  # the moves
     n_steps: int = 10  # moves an episode
@@ -171,29 +171,30 @@ class NbvReport:
     """What every planner scored."""
 
     config: NbvConfig
-    ours: dict[str, list[Episode]]  # by planner, under our set-up
-    paper: dict[str, list[Episode]]  # and under the paper's
+    our_episodes: dict[str, list[Episode]]  # by planner, under our set-up
+    paper_episodes: dict[str, list[Episode]]  # by planner, under the paper's
     block: NDArray[np.int64]  # [episodes] the stretch of 20 m that each began in
     same_route: SameRoute | None = None  # whether the landmark traverse drove the mapped route; None: nobody looked
 
     @property
     def best_constant(self) -> str:
         """The constant move that took the fewest views, known only afterwards."""
-        constants = [name for name in self.ours if name.startswith(CONSTANT)]
-        return min(constants, key=lambda name: float(self._each(name, "views").mean()))
+        constants = [name for name in self.our_episodes if name.startswith(CONSTANT)]
+        return min(constants, key=lambda name: float(self._values(name, "views").mean()))
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7; percent."""
-        shares = {name: 100 * self._each(name, "rank_share") for name in self.ours}
+        shares = {name: 100 * self._values(name, "rank_share") for name in self.our_episodes}
         by_episode = {name: rows.mean(axis=1) for name, rows in shares.items()}
-        views, metres = ({name: self._each(name, part) for name in self.ours} for part in ("views", "metres"))
-        wrong = {name: 100 * self._each(name, "is_wrong") for name in self.ours}
+        views, metres = ({name: self._values(name, part) for name in self.our_episodes} for part in ("views", "metres"))
+        wrong = {name: 100 * self._values(name, "is_wrong") for name in self.our_episodes}
         rivals = (RANDOM, self.best_constant)
         return {
             "anr": _means(by_episode),
             "default": DEFAULT_PLANNER,
             "anr_paper": {
-                name: float(100 * _stack(episodes, "rank_share").mean()) for name, episodes in self.paper.items()
+                name: float(100 * _stack(episodes, "rank_share").mean())
+                for name, episodes in self.paper_episodes.items()
             },
             "interval_95": self._intervals(by_episode),
             "difference_95": self._differences(by_episode, rivals),
@@ -204,23 +205,23 @@ class NbvReport:
             "best_constant": self.best_constant,
             "anr_by_step": {name: rows.mean(axis=0).tolist() for name, rows in shares.items()},
             "anr_at_distance_m": {
-                name: _at_distances(rows, self._each(name, "travelled_m")) for name, rows in shares.items()
+                name: _at_distances(rows, self._values(name, "travelled_m")) for name, rows in shares.items()
             },
             "n_episodes": len(self.block),
             "second_season": None if self.same_route is None else self.same_route.as_dict(),
             "config": {**asdict(self.config), **sources},
         }
 
-    def _each(self, planner: str, part: str) -> NDArray[np.float64]:
-        return _stack(self.ours[planner], part)
+    def _values(self, planner: str, part: str) -> NDArray[np.float64]:
+        return _stack(self.our_episodes[planner], part)
 
     def _intervals(self, values: Mapping[str, NDArray[np.float64]]) -> dict[str, list[float]]:
         return {name: list(mean_interval(rows, self.config.seed, self.block)) for name, rows in values.items()}
 
     def _differences(self, values: Mapping[str, NDArray[np.float64]], rivals: Sequence[str]) -> dict[str, list[float]]:
-        """Of the default planner's values and its rivals', episode by episode."""
-        apart = {f"{DEFAULT_PLANNER} - {rival}": values[DEFAULT_PLANNER] - values[rival] for rival in rivals}
-        return self._intervals(apart)
+        """Intervals of the default planner's values less its rivals', episode by episode."""
+        differences = {f"{DEFAULT_PLANNER} - {rival}": values[DEFAULT_PLANNER] - values[rival] for rival in rivals}
+        return self._intervals(differences)
 
 
 def _stack(episodes: Sequence[Episode], part: str) -> NDArray[np.float64]:
@@ -247,7 +248,7 @@ class Setup:
     name: str  # ours, or the paper's
     map: Map
     update: UpdateRule
-    action_std_m: float | None  # how far a move is trusted; None: as usual
+    action_std_m: float | None  # as of `EpisodeRunner`
 
 
 def run_nbv(
@@ -262,7 +263,7 @@ def run_nbv(
     """Map, train, and drive every planner's episodes.
 
     Args:
-        pictures: Of the landmark traverse, for evaluators that are fitted to images.
+        pictures: Images of the landmark traverse, for evaluators that are fitted to them.
 
     Raises:
         InvalidMapConfigError: The test traverse is shorter than an episode.
@@ -273,11 +274,11 @@ def run_nbv(
         progress.stage(f"map ({name})")
         relevance, *_ = _setup(config, name)
         plan = MapPlan(relevance, config.list_length, config.actions_m, same_route=config.same_route)
-        built = build(
+        map_build = build(
             plan, training, landmarks, landmarks, config.n_landmarks, evaluator, progress.update, fitter=fitter
         )
         progress.stage(f"train ({name})")
-        setup = trained(config, name, built, progress.update)
+        setup = train_setup(config, name, map_build, progress.update)
         views = views_of(measure_drive(test, setup.map.landmark_model, evaluator))
         drive = TestDrive(views, test.route(), nearest_images(test, training))
         results[name] = {}
@@ -285,7 +286,7 @@ def run_nbv(
             progress.stage(f"{planner} ({name})")
             results[name][planner] = drive_planner(config, setup, planner, drive, starts, progress.update)
     block = (test.position_m[starts] // BLOCK_M).astype(np.int64)
-    return NbvReport(config, results["ours"], results["paper"], block, built.same_route)
+    return NbvReport(config, results["ours"], results["paper"], block, map_build.same_route)
 
 
 def starts_of(config: NbvConfig, test: Drive) -> NDArray[np.int64]:
@@ -301,20 +302,22 @@ def starts_of(config: NbvConfig, test: Drive) -> NDArray[np.int64]:
 
 
 def _setup(config: NbvConfig, name: str) -> tuple[Relevance, UpdateRule, float | None]:
-    """Relevance, update, and how far a move is trusted: ours, or the paper's."""
+    """Relevance, update and `action_std_m` of our set-up or the paper's."""
     if name == "ours":
         return config.relevance, config.update, None
     return Relevance.RRF, UpdateRule.ADDITIVE_RELEVANCE, 0.7  # metres: the blur of the paper's reference figures
 
 
-def trained(config: NbvConfig, name: str, built: Built, on_progress: Callable[[float], None]) -> Setup:
-    """A set-up whose map has learnt its Q-values."""
+def train_setup(config: NbvConfig, name: str, map_build: Built, on_progress: Callable[[float], None]) -> Setup:
+    """Let a map learn its Q-values under a set-up, by its name."""
     _, update, action_std_m = _setup(config, name)
     nnql = NnqlConfig(
         config.training_episodes, config.n_steps, update=update, motion_std_m=action_std_m, seed=config.seed
     )
-    q_values, _ = train_nnql(built.rehearsal, built.map_drive, built.second, nnql, on_progress, available_cores())
-    return Setup(name, replace(built.map, q_values=q_values), update, action_std_m)
+    q_values, _ = train_nnql(
+        map_build.rehearsal, map_build.map_drive, map_build.second, nnql, on_progress, available_cores()
+    )
+    return Setup(name, replace(map_build.map, q_values=q_values), update, action_std_m)
 
 
 def drive_planner(
@@ -325,17 +328,17 @@ def drive_planner(
     starts: NDArray[np.int64],
     on_progress: Callable[[float], None],
 ) -> list[Episode]:
-    """A planner's episodes."""
-    # The localizer plans by itself alone; what only an experiment has is a chooser, and planning costs nothing.
-    own = planner if planner in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
-    localizer = ActiveLocalizer(setup.map, LocalizerConfig(update=setup.update, planner=own))
-    # Of the paper's set-up only ranks are told, which additive updates hardly ever make sure
+    """A planner's episodes, one from every start."""
+    # Where a chooser that only an experiment has plans, the localizer's own planner is one that costs nothing.
+    localizer_planner = planner if planner in {NNQL, DEFAULT_PLANNER} else f"{CONSTANT}:{config.actions_m[0]:g}"
+    localizer = ActiveLocalizer(setup.map, LocalizerConfig(update=setup.update, planner=localizer_planner))
+    # Of the paper's set-up only ranks are reported: additive updates hardly ever make a robot sure.
     runner = EpisodeRunner(localizer, drive, config.n_steps, setup.action_std_m, until_sure=setup.name == "ours")
     return _episodes(runner, starts, _chooser(planner, runner, config), planner == RANDOM, on_progress)
 
 
 def planner_names(config: NbvConfig) -> list[str]:
-    """In the order in which they are driven."""
+    """The planners in the order in which they are driven."""
     constants = (f"{CONSTANT}_{action_m:g}" for action_m in config.actions_m)
     return [RANDOM, *constants, CLAIRVOYANT, NNQL, DEFAULT_PLANNER]
 
@@ -356,12 +359,12 @@ def _episodes(
     runner: EpisodeRunner, starts: NDArray[np.int64], choose: Chooser, draws: bool, on_progress: Callable[[float], None]
 ) -> list[Episode]:
     """Every start's episode; where nothing is drawn, equal starts have equal episodes and are run once."""
-    driven: dict[int, Episode] = {}
+    episode_by_start: dict[int, Episode] = {}
     episodes = []
     for number, start in enumerate(starts.tolist()):
-        if draws or start not in driven:
-            driven[start] = runner.run(number, start, choose)
-        episodes.append(driven[start])
+        if draws or start not in episode_by_start:
+            episode_by_start[start] = runner.run(number, start, choose)
+        episodes.append(episode_by_start[start])
         on_progress((number + 1) / starts.size)
     return episodes
 
@@ -371,7 +374,7 @@ def _at_distances(shares: NDArray[np.float64], travelled_m: NDArray[np.float64])
     anr: dict[str, float | None] = {}
     for distance_m in DISTANCES_M:
         n_within = (travelled_m <= distance_m + 1e-9).sum(axis=1)
-        reached = (travelled_m[:, -1] >= distance_m - 1e-9) & (n_within > 0)
-        last = shares[np.arange(len(shares)), np.maximum(n_within - 1, 0)]
-        anr[f"{distance_m:g}"] = float(last[reached].mean()) if reached.any() else None
+        is_reached = (travelled_m[:, -1] >= distance_m - 1e-9) & (n_within > 0)
+        last_shares = shares[np.arange(len(shares)), np.maximum(n_within - 1, 0)]
+        anr[f"{distance_m:g}"] = float(last_shares[is_reached].mean()) if is_reached.any() else None
     return anr

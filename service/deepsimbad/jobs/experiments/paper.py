@@ -35,16 +35,16 @@ from deepsimbad.jobs.experiments.nbv import (
     drive_planner,
     planner_names,
     starts_of,
-    trained,
+    train_setup,
 )
 from deepsimbad.jobs.experiments.truth import nearest_images
 from deepsimbad.jobs.experiments.vpr import (
     RANKS,
-    ViewsOf,
+    DriveViews,
     VprConfig,
     bits_per_map_image,
     build_maps,
-    listed_anew,
+    relisted_map,
     score_maps,
     vpr_stages,
 )
@@ -76,11 +76,11 @@ class PaperConfig:
     seed: int = 0
 
     def vpr(self, relevances: tuple[Relevance, ...] = tuple(Relevance)) -> VprConfig:
-        """As `experiment vpr` would have it."""
+        """The configuration of `experiment vpr`."""
         return VprConfig(self.n_landmarks, self.list_length, self.tolerances_m[0], relevances, self.seed)
 
     def nbv(self) -> NbvConfig:
-        """As `experiment nbv` would have it."""
+        """The configuration of `experiment nbv`."""
         return NbvConfig(
             n_landmarks=self.n_landmarks,
             list_length=self.list_length,
@@ -89,22 +89,22 @@ class PaperConfig:
             seed=self.seed,
         )
 
-    def fitting(self, n_landmarks: int) -> "PaperConfig":
-        """For a landmark drive of fewer frames than landmarks are asked for: all of them, and no longer lists."""
-        r = fitting_number(None, n_landmarks, self.n_landmarks)
+    def limited_to(self, n_candidates: int) -> "PaperConfig":
+        """The configuration for a landmark drive of `n_candidates` frames, where those are fewer than its landmarks."""
+        r = fitting_number(None, n_candidates, self.n_landmarks)
         lengths = tuple(h for h in self.list_lengths if h <= r)
         return replace(self, n_landmarks=r, list_length=min(self.list_length, r), list_lengths=lengths)
 
 
 def pieces(config: PaperConfig, triplets: Sequence[Triplet], n_frames: Mapping[str, int]) -> dict[str, float]:
-    """What is to be measured of triplets with the same maps, and the seconds that it may take on one core."""
+    """What is to be measured of triplets with the same maps -> the seconds that it may take on one core."""
     weights: dict[str, float] = {}
-    config, n_map = config.fitting(n_frames[triplets[0][0]]), n_frames[triplets[0][1]]
+    config, n_map = config.limited_to(n_frames[triplets[0][0]]), n_frames[triplets[0][1]]
     for number, triplet in enumerate(triplets):
         n = n_frames[triplet[2]]
         for h in config.list_lengths:
-            listing = 3e-8 * n_map * config.n_landmarks * h if number == 0 else 0.0
-            weights[_piece(triplet, h)] = listing + n * (2e-3 + n_map * h * 6e-9)
+            listing_s = 3e-8 * n_map * config.n_landmarks * h if number == 0 else 0.0
+            weights[_piece(triplet, h)] = listing_s + n * (2e-3 + n_map * h * 6e-9)
         weights[_piece(triplet)] = (0 if number else 20) + 26 * config.episodes * (2e-3 + 4e-6 * n_map)
     return weights
 
@@ -113,8 +113,8 @@ class Pair:
     """A landmark and a training drive, the maps made of them, and what is measured on those.
 
     Args:
-        triplets: Those of the pair.
-        drives: By season; digests and pictures likewise.
+        triplets: The triplets of the pair.
+        drives: Drives by season, as `digests` and `pictures`.
     """
 
     def __init__(
@@ -127,20 +127,20 @@ class Pair:
         pictures: Mapping[str, Pictures],
     ) -> None:
         self._landmarks, self._training = (drives[season] for season in triplets[0][:2])
-        self._config = config.fitting(self._landmarks.n_frames)
+        self._config = config.limited_to(self._landmarks.n_frames)
         self._evaluator, self._triplets, self._drives, self._digests = evaluator, triplets, drives, digests
         self._pictures = pictures.get(triplets[0][0])
         self._setups: dict[str, Setup] = {}
-        self._listed: dict[int, dict[Relevance, Built]] = {}  # the maps of the list length under way
-        self._views = {triplet[2]: ViewsOf(drives[triplet[2]], evaluator) for triplet in triplets}
+        self._relisted_builds: dict[int, dict[Relevance, Built]] = {}  # the maps of the list length under way
+        self._views = {triplet[2]: DriveViews(drives[triplet[2]], evaluator) for triplet in triplets}
 
-    def measure(self, kept: ResultCache, shares: Shares) -> dict[str, Document]:
-        """Everything, or what is kept of it, by triplet."""
+    def measure(self, cache: ResultCache, shares: Shares) -> dict[str, Document]:
+        """Measure everything that the cache does not hold; answers all by triplet."""
         config, results = self._config, {"-".join(triplet): dict[str, Any]() for triplet in self._triplets}
 
-        def keep(piece: str, triplet: Triplet, make: Callable[..., Document], **made_of: Any) -> Document:
+        def keep(piece: str, triplet: Triplet, make: Callable[..., Document], **ingredients: Any) -> Document:
             digests, report = [self._digests[season] for season in triplet], shares.report(piece)
-            result = kept.get(piece.replace(" ", "-"), partial(make, triplet, report), drives=digests, **made_of)
+            result = cache.get(piece.replace(" ", "-"), partial(make, triplet, report), drives=digests, **ingredients)
             report(1.0)
             return result
 
@@ -150,56 +150,59 @@ class Pair:
                 make = partial(self._single_views, h)
                 result = keep(_piece(triplet, h), triplet, make, **vpr, list_length=h)
                 results["-".join(triplet)][str(h)] = result
-            self._listed.clear()
+            self._relisted_builds.clear()
         for triplet in self._triplets:
             result = keep(_piece(triplet), triplet, self._moves, config=asdict(config.nbv()))
             results["-".join(triplet)]["active"] = result
         return results
 
     @cached_property
-    def _built(self) -> dict[Relevance, Built]:
-        """At the one list length that everything is measured at."""
+    def _map_builds(self) -> dict[Relevance, Built]:
+        """Maps by relevance, of the one list length that everything is measured at."""
         fitter = Fitter(self._evaluator, self._pictures, self._config.seed)
         return build_maps(self._config.vpr(), fitter, self._evaluator, self._landmarks, self._training)
 
-    def _at(self, list_length: int) -> dict[Relevance, Built]:
+    def _map_builds_at(self, list_length: int) -> dict[Relevance, Built]:
         if list_length == self._config.list_length:
-            return self._built
-        if list_length not in self._listed:
-            self._listed[list_length] = {
-                name: replace(built, map=listed_anew(built, list_length))
-                for name, built in self._built.items()
+            return self._map_builds
+        if list_length not in self._relisted_builds:
+            self._relisted_builds[list_length] = {
+                name: replace(map_build, map=relisted_map(map_build, list_length))
+                for name, map_build in self._map_builds.items()
                 if name is not Relevance.BRUTE_FORCE  # which has no lists
             }
-        return self._listed[list_length]
+        return self._relisted_builds[list_length]
 
     def _single_views(self, list_length: int, triplet: Triplet, report: Callable[[float], None]) -> Document:
         """Fig. 6 of a triplet at one list length."""
         config, test = self._config, self._drives[triplet[2]]
-        built, whole = self._at(list_length), list_length == self._config.list_length
-        vpr = config.vpr(tuple(built))
+        map_builds, is_main_length = self._map_builds_at(list_length), list_length == self._config.list_length
+        vpr = config.vpr(tuple(map_builds))
         progress = Progress(vpr_stages(vpr), lambda state: report(state.progress))
         truths = [true_images_of(test.route(), self._training.route(), metres) for metres in config.tolerances_m]
-        scores = score_maps(vpr, built, self._views[triplet[2]], truths, progress, bound=whole)
-        at = [f"{metres:g}" for metres in config.tolerances_m]
+        scores = score_maps(vpr, map_builds, self._views[triplet[2]], truths, progress, bound=is_main_length)
+        tolerances = [f"{metres:g}" for metres in config.tolerances_m]
         is_scored = np.array([truth.size > 0 for truth in truths[0]])
         ranks = {name: 100 * score.normalised_ranks for name, score in scores[0].items()}
-        same_route = built[Relevance.COMPOSED].same_route
+        same_route = map_builds[Relevance.COMPOSED].same_route
         return {
             "anr": {name: score.anr for name, score in scores[0].items()},
-            "anr_at": {m: {name: s.anr for name, s in each.items()} for m, each in zip(at, scores, strict=True)},
+            "anr_at": {
+                m: {name: s.anr for name, s in named_scores.items()}
+                for m, named_scores in zip(tolerances, scores, strict=True)
+            },
             "recall": {
-                m: {name: {str(k): s.recall_at[k] for k in RANKS} for name, s in each.items()}
-                for m, each in zip(at, scores, strict=True)
+                m: {name: {str(k): s.recall_at[k] for k in RANKS} for name, s in named_scores.items()}
+                for m, named_scores in zip(tolerances, scores, strict=True)
             },
             "n_queries": int(is_scored.sum()),
             "n_left_out": int((~is_scored).sum()),
             "blocks": _by_block(ranks, (test.position_m[is_scored] // BLOCK_M).astype(np.int64)),
             "second_season": None if same_route is None else same_route.as_dict(),
             "index_bits": {
-                name.value: bits_per_map_image(each.map)
-                for name, each in built.items()
-                if whole and name is not Relevance.BRUTE_FORCE
+                name.value: bits_per_map_image(map_build.map)
+                for name, map_build in map_builds.items()
+                if is_main_length and name is not Relevance.BRUTE_FORCE
             },
         }
 
@@ -209,57 +212,67 @@ class Pair:
         starts = starts_of(config, test)
         names = [name for name in planner_names(config) if name != CLAIRVOYANT]
         episodes: dict[str, dict[str, list[Episode]]] = {}
-        took_ms = {}
+        timings_ms = {}
         for place, (name, relevance) in enumerate(SETUPS.items()):
             if name not in self._setups:
-                self._setups[name] = trained(config, name, self._built[relevance], lambda _: None)
+                self._setups[name] = train_setup(config, name, self._map_builds[relevance], lambda _: None)
             setup, episodes[name] = self._setups[name], {}
             views = self._views[triplet[2]].by(setup.map.landmark_model)
             drive = TestDrive(views, test.route(), nearest_images(test, self._training))
             for number, planner in enumerate(names):
                 part = partial(_part_of, report, place * len(names) + number, len(SETUPS) * len(names))
                 episodes[name][planner] = drive_planner(config, setup, planner, drive, starts, part)
-            took_ms[name] = self._took_ms(setup, NNQL if name == "paper" else DEFAULT_PLANNER, test)
+            timings_ms[name] = self._median_timings_ms(setup, NNQL if name == "paper" else DEFAULT_PLANNER, test)
         block = (test.position_m[starts] // BLOCK_M).astype(np.int64)
         n_measured = self._training.n_frames + self._landmarks.n_frames  # every frame once, whatever episodes there are
-        told = NbvReport(config, episodes["ours"], episodes["paper"], block).as_dict({})
+        document = NbvReport(config, episodes["ours"], episodes["paper"], block).as_dict({})
         return {
-            **{part: told[part] for part in ("anr", "anr_paper", "best_constant", "n_episodes")},
-            **{part: told[f"{part}_confident"] for part in ("views_to", "metres_to", "wrong_when")},
+            **{part: document[part] for part in ("anr", "anr_paper", "best_constant", "n_episodes")},
+            **{part: document[f"{part}_confident"] for part in ("views_to", "metres_to", "wrong_when")},
             "blocks": {
                 **{
-                    setup: _by_block({name: _each(some, "rank_share") for name, some in driven.items()}, block)
-                    for setup, driven in episodes.items()
+                    setup: _by_block(
+                        {
+                            name: _episode_means(planner_episodes, "rank_share")
+                            for name, planner_episodes in setup_episodes.items()
+                        },
+                        block,
+                    )
+                    for setup, setup_episodes in episodes.items()
                 },
                 "views": _by_block(
-                    {name: _each(some, "views") / 100 for name, some in episodes["ours"].items()}, block
+                    {
+                        name: _episode_means(planner_episodes, "views") / 100
+                        for name, planner_episodes in episodes["ours"].items()
+                    },
+                    block,
                 ),
             },
             "mean_move_m": {
                 setup: {
-                    name: float(np.mean([each.travelled_m[-1] for each in some]) / config.n_steps)
-                    for name, some in driven.items()
+                    name: float(np.mean([episode.travelled_m[-1] for episode in planner_episodes]) / config.n_steps)
+                    for name, planner_episodes in setup_episodes.items()
                 }
-                for setup, driven in episodes.items()
+                for setup, setup_episodes in episodes.items()
             },
-            "took_ms": took_ms,
+            "took_ms": timings_ms,
             "evaluations": n_measured * config.n_landmarks,
-            "evaluations_s": n_measured / 1000 * took_ms["paper"]["describe"],
+            "evaluations_s": n_measured / 1000 * timings_ms["paper"]["describe"],
         }
 
-    def _took_ms(self, setup: Setup, planner: str, test: Drive) -> dict[str, float]:
+    def _median_timings_ms(self, setup: Setup, planner: str, test: Drive) -> dict[str, float]:
         """Median milliseconds of a view's stages, driving along."""
         config = LocalizerConfig(update=setup.update, planner=planner)
         localizer = ActiveLocalizer(setup.map, config, time.perf_counter)
-        state, at_m, took = localizer.start(), float(test.position_m[0]), []
+        state, at_m, timings = localizer.start(), float(test.position_m[0]), []
         for row in range(min(_TIMED_VIEWS, test.n_frames)):
-            began = time.perf_counter()
+            started_s = time.perf_counter()
             view = views_of(measure_drive(test.at(np.array([row])), setup.map.landmark_model, self._evaluator)).at(0)
-            describe_ms = 1000 * (time.perf_counter() - began)
+            describe_ms = 1000 * (time.perf_counter() - started_s)
             step = localizer.step(state, view, float(test.position_m[row]) - at_m)
             state, at_m = step.state, float(test.position_m[row])
-            took.append({"describe": describe_ms, **step.timings_ms})
-        return {stage: float(np.median([each[stage] for each in took])) for stage in took[0]}
+            timings.append({"describe": describe_ms, **step.timings_ms})
+        return {stage: float(np.median([view_timings[stage] for view_timings in timings])) for stage in timings[0]}
 
 
 def _piece(triplet: Triplet, list_length: int | None = None) -> str:
@@ -270,17 +283,17 @@ def _part_of(report: Callable[[float], None], number: int, n_parts: int, share: 
     report((number + share) / n_parts)
 
 
-def _each(episodes: Sequence[Episode], part: str) -> NDArray[np.float64]:
-    """[episodes] mean of a part, percent."""
+def _episode_means(episodes: Sequence[Episode], part: str) -> NDArray[np.float64]:
+    """[episodes] mean of a field of an episode, percent."""
     return np.array([100 * np.mean(getattr(episode, part)) for episode in episodes], np.float64)
 
 
 def _by_block(values: Mapping[str, NDArray[np.float64]], block: NDArray[np.int64]) -> Document:
-    """Sums by stretch of the test drive: all that a bootstrap by stretches asks for."""
+    """Sums by stretch of the test drive, which is all that a bootstrap by stretches needs."""
     _, block = np.unique(block, return_inverse=True)
     return {
         "n": np.bincount(block).tolist(),
-        "sums": {name: np.bincount(block, each).tolist() for name, each in values.items()},
+        "sums": {name: np.bincount(block, figures).tolist() for name, figures in values.items()},
     }
 
 
@@ -289,29 +302,29 @@ def measure_paper(
     evaluator: Evaluator,
     drives: Mapping[str, Drive],
     folder: Path,
-    made_of: Mapping[str, Any],
+    ingredients: Mapping[str, Any],
     tell: Callable[[str, float], None],
     pictures: Mapping[str, Pictures],
 ) -> dict[str, Document]:
-    """Every triplet whose drives are there, by its name; see `Pair`.
+    """Measure every triplet whose drives are there; answers results by the triplet's name.
 
     Args:
         folder: Keeps results.
-        made_of: All that figures depend on beside drives and configuration.
-        tell: Told what is under way and the share that is done, by several threads; may raise CancelledError.
-        pictures: Of the drives, for evaluators that are fitted to images.
+        ingredients: All that figures depend on beside drives and configuration.
+        tell: Called by several threads with what is under way and the share done; may raise CancelledError.
+        pictures: Images of the drives, for evaluators that are fitted to them.
     """
     digests = {season: drive_digest(drive) for season, drive in drives.items()}
-    kept = ResultCache(folder, {**made_of, "code": code_digest()})
-    works = [Pair(config, evaluator, triplets, drives, digests, pictures) for triplets in _pairs(drives)]
+    cache = ResultCache(folder, {**ingredients, "code": code_digest()})
+    pairs = [Pair(config, evaluator, triplets, drives, digests, pictures) for triplets in _pairs(drives)]
     n_frames = {season: drive.n_frames for season, drive in drives.items()}
     shares = Shares(tell, seconds_to_measure(config, n_frames))
     results: dict[str, Document] = {}
 
-    def measure(work: Pair) -> None:
-        results.update(work.measure(kept, shares))
+    def measure(pair: Pair) -> None:
+        results.update(pair.measure(cache, shares))
 
-    in_threads([partial(measure, work) for work in works])
+    in_threads([partial(measure, pair) for pair in pairs])
     return {"-".join(triplet): results["-".join(triplet)] for triplet in runnable(drives)}
 
 
@@ -329,5 +342,5 @@ def _pairs(seasons: Collection[str]) -> list[list[Triplet]]:
 
 
 def seconds_to_measure(config: PaperConfig, n_frames: Mapping[str, int]) -> dict[str, float]:
-    """What every piece of the measuring may take on one core, by its name; drives by season."""
+    """The seconds that every piece of the measuring may take on one core, by its name; `n_frames` is by season."""
     return {name: s for triplets in _pairs(n_frames) for name, s in pieces(config, triplets, n_frames).items()}

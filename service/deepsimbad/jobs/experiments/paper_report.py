@@ -1,4 +1,4 @@
-"""What the triplets of the paper come to together: means, intervals over stretches and over drives, claims judged."""
+"""What the paper's triplets show together: means, intervals over stretches and over drives, and claims judged."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _CHANCE, _NEAR_CHANCE = 50.0, 45.0  # ANR, percent
 
 
 @dataclass(frozen=True)
-class Pooled:
+class PooledFigures:
     """One figure of every method over the test frames of all triplets, by stretches of 20 m."""
 
     n: NDArray[np.int64]  # [stretches] frames or starts there
@@ -27,15 +27,18 @@ class Pooled:
 
     @classmethod
     def of(cls, blocks: Mapping[str, Document]) -> Self:
-        """Of triplets' `blocks`, by the triplet's name."""
+        """Pool the `blocks` of triplets, which are given by the triplet's name."""
         seasons = list(SEASONS)
-        drive = [np.full(len(each["n"]), seasons.index(triplet[-2:])) for triplet, each in blocks.items()]
-        first = next(iter(blocks.values()))
-        sums = {name: np.concatenate([each["sums"][name] for each in blocks.values()]) for name in first["sums"]}
-        return cls(np.concatenate([each["n"] for each in blocks.values()]), sums, np.concatenate(drive))
+        drive = [np.full(len(document["n"]), seasons.index(triplet[-2:])) for triplet, document in blocks.items()]
+        first_document = next(iter(blocks.values()))
+        sums = {
+            name: np.concatenate([document["sums"][name] for document in blocks.values()])
+            for name in first_document["sums"]
+        }
+        return cls(np.concatenate([document["n"] for document in blocks.values()]), sums, np.concatenate(drive))
 
     def mean(self, name: str) -> float:
-        """Of all frames."""
+        """A method's mean over all frames."""
         return float(self.sums[name].sum() / self.n.sum())
 
     def figures(self, seed: int) -> dict[str, Document]:
@@ -47,7 +50,7 @@ class Pooled:
         return {"mean": self.mean(name) - self.mean(rival), **self._intervals(self.sums[name] - self.sums[rival], seed)}
 
     def _intervals(self, sums: NDArray[np.float64], seed: int) -> dict[str, list[float]]:
-        """95 %, by stretches, and by test drives: of what other stretches and what other days would have shown."""
+        """95 % intervals by stretches and by test drives: what other stretches and other days would have shown."""
         values = np.repeat(sums / self.n, self.n)
         stretches, drives = np.arange(self.n.size), self.drive
         return {
@@ -58,62 +61,74 @@ class Pooled:
 
 def paper_document(config: PaperConfig, results: Mapping[str, Document]) -> Document:
     """Everything that the report shows of what was measured, JSON-ready; percent."""
-    lengths = [h for h in config.list_lengths if all(str(h) in each for each in results.values())]
-    at = {h: {triplet: each[str(h)] for triplet, each in results.items()} for h in lengths}
+    lengths = [h for h in config.list_lengths if all(str(h) in document for document in results.values())]
+    by_length = {h: {triplet: document[str(h)] for triplet, document in results.items()} for h in lengths}
     h = min(lengths, key=lambda length: abs(length - config.list_length))
-    active = {triplet: each["active"] for triplet, each in results.items()}
-    single = {length: Pooled.of({t: each["blocks"] for t, each in at[length].items()}) for length in lengths}
+    active = {triplet: document["active"] for triplet, document in results.items()}
+    views = {
+        length: PooledFigures.of({t: document["blocks"] for t, document in by_length[length].items()})
+        for length in lengths
+    }
     moves = {
-        setup: Pooled.of({triplet: each["blocks"][setup] for triplet, each in active.items()})
+        setup: PooledFigures.of({triplet: document["blocks"][setup] for triplet, document in active.items()})
         for setup in (*SETUPS, "views")
     }
-    first, first_moves = next(iter(at[h].values())), next(iter(active.values()))
+    first_document, first_moves = next(iter(by_length[h].values())), next(iter(active.values()))
     return {
-        "anr": {str(length): each.figures(config.seed) for length, each in single.items()},
-        "recall": _mean_of([each["recall"] for each in at[h].values()]),
-        "anr_at": _mean_of([each["anr_at"] for each in at[h].values()]),
-        "active": {setup: each.figures(config.seed) for setup, each in moves.items()},
-        "wrong_when_confident": _mean_of([_numbers(each["wrong_when"]) for each in active.values()]),
-        "metres_to_confident": _mean_of([_numbers(each["metres_to"]) for each in active.values()]),
-        "mean_move_m": _mean_of([each["mean_move_m"] for each in active.values()]),
-        "index_bits_per_map_image": _mean_of([each["index_bits"] for each in at[h].values()]),
-        "took_ms": _mean_of([each["took_ms"] for each in active.values()]),
+        "anr": {str(length): pooled.figures(config.seed) for length, pooled in views.items()},
+        "recall": _mean_of([document["recall"] for document in by_length[h].values()]),
+        "anr_at": _mean_of([document["anr_at"] for document in by_length[h].values()]),
+        "active": {setup: pooled.figures(config.seed) for setup, pooled in moves.items()},
+        "wrong_when_confident": _mean_of([_numbers(document["wrong_when"]) for document in active.values()]),
+        "metres_to_confident": _mean_of([_numbers(document["metres_to"]) for document in active.values()]),
+        "mean_move_m": _mean_of([document["mean_move_m"] for document in active.values()]),
+        "index_bits_per_map_image": _mean_of([document["index_bits"] for document in by_length[h].values()]),
+        "took_ms": _mean_of([document["took_ms"] for document in active.values()]),
         "evaluations": first_moves["evaluations"],
         "evaluations_s": first_moves["evaluations_s"],
         "evaluations_of_the_paper": config.training_episodes * 10 * config.n_landmarks,
         "list_length": h,
-        "n_queries": sum(each["n_queries"] for each in at[h].values()),
-        "n_left_out": sum(each["n_left_out"] for each in at[h].values()),
-        "n_episodes": sum(each["n_episodes"] for each in active.values()),
-        "second_season": {triplet: each["second_season"] for triplet, each in at[h].items()},
-        "claims": [*_claims_of_views(single[h], at[h], config.seed), *_claims_of_moves(moves, active, config.seed)],
+        "n_queries": sum(document["n_queries"] for document in by_length[h].values()),
+        "n_left_out": sum(document["n_left_out"] for document in by_length[h].values()),
+        "n_episodes": sum(document["n_episodes"] for document in active.values()),
+        "second_season": {triplet: document["second_season"] for triplet, document in by_length[h].items()},
+        "claims": [
+            *_claims_of_views(views[h], by_length[h], config.seed),
+            *_claims_of_moves(moves, active, config.seed),
+        ],
         "by_triplet": {
             triplet: {
-                "anr": {str(length): at[length][triplet]["anr"] for length in lengths},
-                "recall": at[h][triplet]["recall"],
-                "active": {"ours": each["anr"], "paper": each["anr_paper"]},
-                "views_to_confident": _numbers(each["views_to"]),
+                "anr": {str(length): by_length[length][triplet]["anr"] for length in lengths},
+                "recall": by_length[h][triplet]["recall"],
+                "active": {"ours": document["anr"], "paper": document["anr_paper"]},
+                "views_to_confident": _numbers(document["views_to"]),
             }
-            for triplet, each in active.items()
+            for triplet, document in active.items()
         },
-        "methods": [*first["anr"]],
+        "methods": [*first_document["anr"]],
     }
 
 
 def _numbers(figures: Mapping[str, Any]) -> dict[str, float]:
-    """Without the intervals that lie beside them."""
+    """The numbers of a document, without the intervals that lie beside them."""
     return {name: value for name, value in figures.items() if isinstance(value, float)}
 
 
 def _mean_of(documents: Sequence[Any]) -> Any:
-    """Number by number."""
+    """The mean of documents of one form, number by number."""
     if isinstance(documents[0], Mapping):
-        return {key: _mean_of([each[key] for each in documents]) for key in documents[0]}
-    return float(np.mean([np.nan if each is None else each for each in documents]))
+        return {key: _mean_of([document[key] for document in documents]) for key in documents[0]}
+    return float(np.mean([np.nan if document is None else document for document in documents]))
 
 
-def _judged(
-    claim: str, pooled: Pooled, name: str, rival: str, agree: Sequence[bool], seed: int, said_by: str = "paper"
+def _judge(
+    claim: str,
+    pooled: PooledFigures,
+    name: str,
+    rival: str,
+    is_less: Sequence[bool],
+    seed: int,
+    said_by: str = "paper",
 ) -> Document:
     """A claim that one method's figure is less than another's; whether it is so in every triplet."""
     difference = pooled.difference(name, rival, seed)
@@ -125,39 +140,39 @@ def _judged(
         "said_by": said_by,
         "values": {name: pooled.mean(name), rival: pooled.mean(rival)},
         "difference": difference,
-        "n_agree": int(sum(agree)),
-        "n_triplets": len(agree),
+        "n_agree": int(sum(is_less)),
+        "n_triplets": len(is_less),
         "verdict": verdict,
         "why": "",
     }
 
 
-def _claims_of_views(pooled: Pooled, at: Mapping[str, Document], seed: int) -> list[Document]:
-    """What Fig. 6 says at the list length that everything is measured at, and what we say."""
+def _claims_of_views(pooled: PooledFigures, documents: Mapping[str, Document], seed: int) -> list[Document]:
+    """The claims of Fig. 6, at the list length that everything is measured at, and ours."""
 
-    def judged(claim: str, name: str, rival: str, said_by: str = "paper") -> Document:
-        agree = [each["anr"][name] < each["anr"][rival] for each in at.values()]
-        return _judged(claim, pooled, name, rival, agree, seed, said_by)
+    def judge(claim: str, name: str, rival: str, said_by: str = "paper") -> Document:
+        is_less = [document["anr"][name] < document["anr"][rival] for document in documents.values()]
+        return _judge(claim, pooled, name, rival, is_less, seed, said_by)
 
-    brute, rrf, ours = Relevance.BRUTE_FORCE.value, Relevance.RRF.value, DEFAULT_RELEVANCE.value
-    claims = [judged("Brute force beats RRF", brute, rrf)]
-    claims += [judged(f"RRF beats {shown_name(each)}", rrf, each) for each in _FELL_BEHIND]
+    brute, rrf, our_relevance = Relevance.BRUTE_FORCE.value, Relevance.RRF.value, DEFAULT_RELEVANCE.value
+    claims = [judge("Brute force beats RRF", brute, rrf)]
+    claims += [judge(f"RRF beats {display_name(rival)}", rrf, rival) for rival in _FELL_BEHIND]
     for name in _FELL_BEHIND:
         figure = pooled.figures(seed)[name]
         low, high = figure["stretches"]
         claims.append(
             {
-                "claim": f"{shown_name(name)[0].upper()}{shown_name(name)[1:]} is as bad as chance",
+                "claim": f"{display_name(name)[0].upper()}{display_name(name)[1:]} is as bad as chance",
                 "said_by": "paper",
                 "values": {name: figure["mean"], "chance": _CHANCE},
                 "difference": {"mean": figure["mean"] - _CHANCE, "stretches": [low - _CHANCE, high - _CHANCE]},
-                "n_agree": sum(each["anr"][name] >= _NEAR_CHANCE for each in at.values()),
-                "n_triplets": len(at),
+                "n_agree": sum(document["anr"][name] >= _NEAR_CHANCE for document in documents.values()),
+                "n_triplets": len(documents),
                 "verdict": HOLDS if low >= _NEAR_CHANCE else OTHERWISE if high < _NEAR_CHANCE else UNDECIDED,
                 "why": "",
             }
         )
-    claims += [judged(f"Composed beats {shown_name(each)}", ours, each, "us") for each in (rrf, brute)]
+    claims += [judge(f"Composed beats {display_name(rival)}", our_relevance, rival, "us") for rival in (rrf, brute)]
     if claims[0]["verdict"] != HOLDS and pooled.mean(BRUTE_FORCE_U) < pooled.mean(brute):
         claims[0]["why"] = (
             f"Brute force errs by what a season shifts and scales: with every number standardised by its own drive the "
@@ -166,29 +181,32 @@ def _claims_of_views(pooled: Pooled, at: Mapping[str, Document], seed: int) -> l
     return claims
 
 
-def _claims_of_moves(moves: Mapping[str, Pooled], active: Mapping[str, Document], seed: int) -> list[Document]:
-    """What Fig. 7 says, and what we say of views until the robot is sure."""
+def _claims_of_moves(
+    moves: Mapping[str, PooledFigures], documents: Mapping[str, Document], seed: int
+) -> list[Document]:
+    """The claims of Fig. 7, and ours of views until the robot is sure."""
 
-    def judged(claim: str, setup: str, name: str, rival: str, said_by: str = "paper") -> Document:
-        at: Callable[[Document], Mapping[str, float]] = {
-            "paper": lambda each: each["anr_paper"],
-            "ours": lambda each: each["anr"],
-            "views": lambda each: each["views_to"],
+    def judge(claim: str, setup: str, name: str, rival: str, said_by: str = "paper") -> Document:
+        figures_of: Callable[[Document], Mapping[str, float]] = {
+            "paper": lambda document: document["anr_paper"],
+            "ours": lambda document: document["anr"],
+            "views": lambda document: document["views_to"],
         }[setup]
-        agree = [at(each)[name] < at(each)[rival] for each in active.values()]
-        return _judged(claim, moves[setup], name, rival, agree, seed, said_by)
+        is_less = [figures_of(document)[name] < figures_of(document)[rival] for document in documents.values()]
+        return _judge(claim, moves[setup], name, rival, is_less, seed, said_by)
 
     pooled, views = moves["paper"], moves["views"]
     best, soonest = (
-        min((name for name in each.sums if name.startswith(CONSTANT)), key=each.mean) for each in (pooled, views)
+        min((name for name in figures.sums if name.startswith(CONSTANT)), key=figures.mean)
+        for figures in (pooled, views)
     )
-    move_m = float(np.mean([each["mean_move_m"]["paper"][NNQL] for each in active.values()]))
+    move_m = float(np.mean([document["mean_move_m"]["paper"][NNQL] for document in documents.values()]))
     claims = [
-        judged("NNQL beats random moves", "paper", NNQL, RANDOM),
-        judged(f"NNQL beats the best constant move, {shown_name(best)}", "paper", NNQL, best),
-        judged("Informed needs fewer views than random moves", "views", DEFAULT_PLANNER, RANDOM, "us"),
-        judged(
-            f"Informed needs fewer views than the best constant move, {shown_name(soonest)}",
+        judge("NNQL beats random moves", "paper", NNQL, RANDOM),
+        judge(f"NNQL beats the best constant move, {display_name(best)}", "paper", NNQL, best),
+        judge("Informed needs fewer views than random moves", "views", DEFAULT_PLANNER, RANDOM, "us"),
+        judge(
+            f"Informed needs fewer views than the best constant move, {display_name(soonest)}",
             *("views", DEFAULT_PLANNER, soonest, "us"),
         ),
     ]
@@ -205,7 +223,7 @@ def _claims_of_moves(moves: Mapping[str, Pooled], active: Mapping[str, Document]
 _FELL_BEHIND = (Relevance.BAG_OF_LANDMARKS.value, Relevance.SIMBAD.value)
 
 
-def shown_name(name: str) -> str:
+def display_name(name: str) -> str:
     """A method's or a planner's name as a sentence has it."""
     if name.startswith(f"{CONSTANT}_"):
         return f"{name.removeprefix(f'{CONSTANT}_')} m"

@@ -1,4 +1,4 @@
-"""Two drives tried out: one is mapped, the other localized on it in order as one session, and held to the truth."""
+"""A trial of two drives: one is mapped, the other localized on it in order as one session, and held to the truth."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -22,7 +22,13 @@ from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.jobs.experiments.truth import nearest_images
-from deepsimbad.jobs.experiments.vpr import BRUTE_FORCE_U, bits_per_map_image, moves_between, relevances_by_all, told
+from deepsimbad.jobs.experiments.vpr import (
+    BRUTE_FORCE_U,
+    bits_per_map_image,
+    moves_between,
+    relevances_by_all,
+    scores_document,
+)
 from deepsimbad.jobs.fitting import Fitter, Pictures
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import DEFAULT_LIST_LENGTH, DEFAULT_N_LANDMARKS
@@ -40,11 +46,11 @@ class Outcome:
     true_image: int | None  # the nearest of those that are true; None: the map does not hold the place
     rank: float | None  # of the best-placed true image, from 0; None where there is none
     error_m: float | None  # from the best image to the true one
-    belief_error_m: float | None  # the same from the place that the session holds likeliest by then
+    belief_error_m: float | None  # from the image that the session then believes likeliest to the true one
 
     @property
     def is_wrong(self) -> bool:
-        """It has a true image, and another came first."""
+        """Whether it has a true image, and another came first."""
         return self.rank is not None and self.rank >= 1
 
 
@@ -61,34 +67,37 @@ class Stretch:
 
 @dataclass(frozen=True)
 class TrialReport:
-    """What a trial came to."""
+    """The results of a trial."""
 
     map: Map
     queries: Drive
     outcomes: list[Outcome]  # in the order of the queries
-    belief: NDArray[np.float32]  # [m, b] after each query, by equal parts of the map's route
-    scores: dict[str, RetrievalScores]  # of the map's lists; and of the whole vectors that they stand for
+    belief: NDArray[np.float32]  # [m, b] mass after each query in equal parts of the map's route
+    scores: dict[str, RetrievalScores]  # of the map's lists, and of the whole vectors that they stand for
     seconds: dict[str, float]  # by stage
     n_forgot: int = 0  # moves that the belief had no room for, after which the session began anew
     warnings: tuple[str, ...] = ()  # of fitting the evaluator
 
     @cached_property
     def stretches(self) -> list[Stretch]:
-        """Those where some query fails, worst first."""
+        """The stretches in which some query fails, worst first."""
         return _stretches(self.queries, self.outcomes)
 
     def as_dict(self, config: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document, as `experiment vpr` has it."""
         errors = [outcome.error_m for outcome in self.outcomes if outcome.error_m is not None]
-        by_belief = [outcome.belief_error_m for outcome in self.outcomes if outcome.belief_error_m is not None]
-        near = [error_m <= CONFIDENT_WITHIN_M for error_m in by_belief]
+        belief_errors = [outcome.belief_error_m for outcome in self.outcomes if outcome.belief_error_m is not None]
+        is_near = [error_m <= CONFIDENT_WITHIN_M for error_m in belief_errors]
         return {
-            **told(self.scores, (1, 5)),
-            "recall_at": {name: {str(n): r for n, r in each.recall_at.items()} for name, each in self.scores.items()},
+            **scores_document(self.scores, (1, 5)),
+            "recall_at": {
+                name: {str(n): r for n, r in method_scores.recall_at.items()}
+                for name, method_scores in self.scores.items()
+            },
             "n_map_images": self.map.n_images,
             "n_landmarks": self.map.n_landmarks,
             "error_m": {"median": _quantile(errors, 0.5), "p90": _quantile(errors, 0.9)},
-            "belief_within_5_m": 100 * float(np.mean(near)) if near else float("nan"),
+            "belief_within_5_m": 100 * float(np.mean(is_near)) if is_near else float("nan"),
             "n_forgot": self.n_forgot,
             "fails": [asdict(stretch) for stretch in self.stretches],
             "index_bits_per_map_image": bits_per_map_image(self.map),
@@ -113,32 +122,32 @@ def run_trial(
         landmarks: Another drive to choose landmarks from and learn from; None: the database's own frames.
         true_images: For every query the map images that count as true.
         same_route: Whether positions of the landmark drive and the database are comparable; None: where both know x, y.
-        pictures: Of the drive that landmarks are chosen from, for evaluators that are fitted to images.
+        pictures: Images of the drive that landmarks are chosen from, for evaluators that are fitted to them.
     """
     progress.stage("map")
     plan = MapPlan(DEFAULT_RELEVANCE, DEFAULT_LIST_LENGTH, (CONFIDENT_WITHIN_M,), same_route=same_route)
     n_landmarks = fitting_number(None, (landmarks or database).n_frames, DEFAULT_N_LANDMARKS)
     fitter = Fitter(evaluator, pictures)
-    built = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
+    map_build = build(plan, database, landmarks, landmarks, n_landmarks, evaluator, progress.update, fitter=fitter)
     progress.stage("localize")
-    views = views_of(measure_drive(queries, built.map.landmark_model, evaluator))
-    scorer, by_all, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
+    views = views_of(measure_drive(queries, map_build.map.landmark_model, evaluator))
+    scorer, all_scorer, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
     nearest, beliefs, n_forgot = nearest_images(queries, database), [], 0
-    whole = relevances_by_all(built, views, moves_between(queries), stateless=False)
-    seen = zip(true_images, whole, _in_order(built.map, views, queries), strict=True)
-    for row, (truth, of_all, (relevance, belief, forgot)) in enumerate(seen):
-        by_all.add(of_all, truth)
+    all_relevances = relevances_by_all(map_build, views, moves_between(queries), stateless=False)
+    answers = zip(true_images, all_relevances, _in_order(map_build.map, views, queries), strict=True)
+    for row, (truth, frame_relevances, (relevance, belief, has_forgotten)) in enumerate(answers):
+        all_scorer.add(frame_relevances, truth)
         rank, mass = scorer.add(relevance, truth), belief.mass
-        outcomes.append(_outcome(built.map, relevance, mass, truth, rank, int(nearest[row])))
+        outcomes.append(_outcome(map_build.map, relevance, mass, truth, rank, int(nearest[row])))
         beliefs.append(belief.route.histogram_of(mass))
-        n_forgot += forgot
+        n_forgot += has_forgotten
         progress.update((row + 1) / len(true_images))
-    scores = {DEFAULT_RELEVANCE.value: scorer.result(), BRUTE_FORCE_U: by_all.result()}
+    scores = {DEFAULT_RELEVANCE.value: scorer.result(), BRUTE_FORCE_U: all_scorer.result()}
     return TrialReport(
-        *(built.map, queries, outcomes, np.array(beliefs, np.float32), scores),
+        *(map_build.map, queries, outcomes, np.array(beliefs, np.float32), scores),
         {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
         n_forgot,
-        built.warnings,
+        map_build.warnings,
     )
 
 
@@ -151,16 +160,18 @@ def _in_order(map_: Map, views: Query, queries: Drive) -> Iterator[tuple[NDArray
     localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{CONFIDENT_WITHIN_M:g}"))
     state = localizer.start()
     for row, move_m in enumerate(np.diff(queries.position_m, prepend=queries.position_m[0]).tolist()):
-        view, forgot = views.at(row), False
+        view, has_forgotten = views.at(row), False
         try:
             state = localizer.step(state, view, move_m).state
-        except PastTheEndError:  # it was taken for elsewhere: from knowing nothing, but what is usual, on
+        except PastTheEndError:  # it was believed elsewhere: it goes on from an even belief, but keeps its statistics
             route = state.belief.route
-            anew = localizer.with_prior(state, route.start_m + route.length_m / 2, 100 * max(route.length_m, 1.0))
-            state, forgot = localizer.step(anew, view).state, True
+            reset_state = localizer.with_prior(
+                state, route.start_m + route.length_m / 2, 100 * max(route.length_m, 1.0)
+            )
+            state, has_forgotten = localizer.step(reset_state, view).state, True
         if state.relevance is None:
             raise ValueError("a step leaves the view's relevance")
-        yield state.relevance, state.belief, forgot
+        yield state.relevance, state.belief, has_forgotten
 
 
 def _outcome(
@@ -169,25 +180,27 @@ def _outcome(
     mass: NDArray[np.float64],
     truth: NDArray[np.int64],
     rank: float | None,
-    nearest: int,
+    nearest_image: int,
 ) -> Outcome:
-    best = int(relevance.argmax())
+    best_image = int(relevance.argmax())
     if rank is None:
-        return Outcome(best, None, None, None, None)
-    true = nearest if nearest in truth else int(truth[truth.size // 2])  # a file of ground truth may know it better
+        return Outcome(best_image, None, None, None, None)
+    true_image = (
+        nearest_image if nearest_image in truth else int(truth[truth.size // 2])
+    )  # a file of ground truth may know it better
     route = map_.route
-    x_m, y_m = (None if axis is None else float(axis[true]) for axis in (route.x_m, route.y_m))
-    apart_m = route.apart_m(np.array([best, mass.argmax()]), float(route.position_m[true]), x_m, y_m)
-    return Outcome(best, true, rank, *apart_m.tolist())
+    x_m, y_m = (None if axis is None else float(axis[true_image]) for axis in (route.x_m, route.y_m))
+    apart_m = route.apart_m(np.array([best_image, mass.argmax()]), float(route.position_m[true_image]), x_m, y_m)
+    return Outcome(best_image, true_image, rank, *apart_m.tolist())
 
 
 def _stretches(queries: Drive, outcomes: Sequence[Outcome]) -> list[Stretch]:
     edges_m = np.linspace(queries.position_m[0], queries.position_m[-1], min(_N_STRETCHES, len(outcomes)) + 1)
-    part = np.clip(np.searchsorted(edges_m, queries.position_m, side="right") - 1, 0, max(edges_m.size - 2, 0))
+    stretch_of = np.clip(np.searchsorted(edges_m, queries.position_m, side="right") - 1, 0, max(edges_m.size - 2, 0))
     stretches = []
     for number in range(edges_m.size - 1):
-        there = [outcome for outcome, at in zip(outcomes, part, strict=True) if at == number]
-        scored = [outcome for outcome in there if outcome.rank is not None]
+        stretch_outcomes = [outcome for outcome, part in zip(outcomes, stretch_of, strict=True) if part == number]
+        scored = [outcome for outcome in stretch_outcomes if outcome.rank is not None]
         errors = [outcome.error_m for outcome in scored if outcome.is_wrong and outcome.error_m is not None]
         if errors:
             ends_m = float(edges_m[number]), float(edges_m[number + 1])

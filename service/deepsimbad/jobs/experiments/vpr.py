@@ -29,7 +29,7 @@ from deepsimbad.store.arrays import is_halvable
 from deepsimbad.store.map_file import index_bytes, seal, write_map
 
 _QUERIES_A_BLOCK = 64  # of brute force: large enough for a matrix product, small enough for memory
-ACTIONS_M = tuple(float(metres) for metres in range(1, 11))  # over which views err alike is learnt so far
+ACTIONS_M = tuple(float(metres) for metres in range(1, 11))  # how far views err alike is learnt up to the longest
 RANKS = (1, 5, 10)  # of recall
 BRUTE_FORCE_U = "brute_force_u"  # all of the unit vectors that composed lists stand for: the most they could tell
 
@@ -54,22 +54,22 @@ class VprReport:
     """Scores by relevance, and what they cost."""
 
     config: VprConfig
-    scores: dict[str, RetrievalScores]  # by relevance; and of what rivals it
-    # Size on disk of the posting tables, of the map for the relevance that ships (or of the first asked for)
+    scores: dict[str, RetrievalScores]  # by relevance, and by rival
+    # Size on disk of the posting tables, of the map for the relevance that ships (or the first asked for)
     index_bits_per_map_image: float
     seconds: dict[str, float]  # by stage
     same_route: SameRoute | None  # whether the landmark traverse drove the mapped route; None: there is none
     encoding_dim: int  # d
-    bytes_per_encoding: int  # of one frame in a traverse's file, places apart
+    bytes_per_encoding: int  # that one frame's encoding takes in a traverse's file
     encode_ms: float | None  # median from reading an image to its encoding; None where encodings came ready
     fitting: Mapping[str, Any] | None = None  # how the evaluator was fitted; None: it was not
     warnings: tuple[str, ...] = ()  # of fitting
-    passive: PassiveScores | None = None  # the drive in order; None where `composed` is not asked for, or no session
+    passive: PassiveScores | None = None  # of the drive in order; None without `composed`, or without a session
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The stable flat JSON document of design section 7."""
         return {
-            **told(self.scores, RANKS),
+            **scores_document(self.scores, RANKS),
             "index_bits_per_map_image": self.index_bits_per_map_image,
             "passive": None if self.passive is None else self.passive.as_dict(),
             "second_season": None if self.same_route is None else self.same_route.as_dict(),
@@ -82,15 +82,15 @@ class VprReport:
         }
 
 
-def told(scores: Mapping[str, RetrievalScores], ranks: Sequence[int]) -> dict[str, Any]:
-    """Scores by relevance as results tell them, JSON-ready."""
-    first = next(iter(scores.values()))
+def scores_document(scores: Mapping[str, RetrievalScores], ranks: Sequence[int]) -> dict[str, Any]:
+    """The part of a result that holds scores by relevance, JSON-ready; recall at each of the `ranks`."""
+    first_scores = next(iter(scores.values()))
     return {
         "anr": {name: score.anr for name, score in scores.items()},
         **{f"recall_at_{k}": {name: score.recall_at[k] for name, score in scores.items()} for k in ranks},
         "default": DEFAULT_RELEVANCE.value,
-        "n_queries": first.n_queries,
-        "n_left_out": first.n_left_out,
+        "n_queries": first_scores.n_queries,
+        "n_left_out": first_scores.n_left_out,
     }
 
 
@@ -104,7 +104,7 @@ def vpr_stages(config: VprConfig) -> dict[str, float]:
 
 
 def _is_driven(config: VprConfig) -> bool:
-    """Whether views are one session of the relevance that has beliefs of its own."""
+    """Whether the test drive is driven in order too, which takes `composed` and a session."""
     return Relevance.COMPOSED in config.relevances and not config.stateless
 
 
@@ -123,36 +123,36 @@ def run_vpr(
     Args:
         landmarks: The landmark traverse; where it drove the mapped route, maps learn from it. None: the training one.
         true_images: For every test frame the map images that count as true.
-        pictures: Of the landmark traverse, for evaluators that are fitted to images.
+        pictures: Images of the landmark traverse, for evaluators that are fitted to them.
     """
     progress.stage("describe")
-    built = build_maps(
+    map_builds = build_maps(
         config, Fitter(evaluator, pictures, config.seed), evaluator, landmarks, training, progress.update
     )
-    views = ViewsOf(test.drive, evaluator)
-    scores = score_maps(config, built, views, [true_images], progress)[0]
+    test_views = DriveViews(test.drive, evaluator)
+    scores = score_maps(config, map_builds, test_views, [true_images], progress)[0]
     passive: PassiveScores | None = None
     if _is_driven(config):
         progress.stage("drive")
-        map_ = built[Relevance.COMPOSED].map
-        described, moved_m = views.by(map_.landmark_model), moves_between(test.drive)
-        by_all = relevances_by_all(built[Relevance.COMPOSED], described, moved_m, stateless=False)
-        passive = drive_in_order(map_, described, test.drive.position_m, by_all, true_images, progress.update)
+        map_ = map_builds[Relevance.COMPOSED].map
+        views, moved_m = test_views.by(map_.landmark_model), moves_between(test.drive)
+        all_relevances = relevances_by_all(map_builds[Relevance.COMPOSED], views, moved_m, stateless=False)
+        passive = drive_in_order(map_, views, test.drive.position_m, all_relevances, true_images, progress.update)
     stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
-    seconds = {stage: took for stage, took in progress.seconds().items() if stage in stages}
-    sized = built.get(DEFAULT_RELEVANCE, built[config.relevances[0]])
+    seconds = {stage: stage_s for stage, stage_s in progress.seconds().items() if stage in stages}
+    main_build = map_builds.get(DEFAULT_RELEVANCE, map_builds[config.relevances[0]])
     return VprReport(
         config,
         scores,
-        bits_per_map_image(sized.map),
+        bits_per_map_image(main_build.map),
         seconds,
-        sized.same_route,
+        main_build.same_route,
         encoding_dim=test.drive.encoding_dim,
         bytes_per_encoding=bytes_per_encoding(test.drive),
         encode_ms=test.encode_ms,
         passive=passive,
-        fitting=sized.fitting,
-        warnings=sized.warnings,
+        fitting=main_build.fitting,
+        warnings=main_build.warnings,
     )
 
 
@@ -165,36 +165,40 @@ def build_maps(
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> dict[Relevance, Built]:
     """A map of the training traverse for every relevance; all but `composed` share their landmarks."""
-    built: dict[Relevance, Built] = {}
+    map_builds: dict[Relevance, Built] = {}
     model: LandmarkModel | None = None
     for number, name in enumerate(config.relevances):
         plan = MapPlan(
             name, config.list_length, ACTIONS_M, same_route=config.same_route, bars_own_place=config.bar_own_place
         )
-        chosen = landmarks if name is Relevance.COMPOSED or model is None else model
+        landmark_source = landmarks if name is Relevance.COMPOSED or model is None else model
         share = number / len(config.relevances)
-        built[name] = build(
-            *(plan, training, landmarks, chosen, config.n_landmarks, evaluator),
-            lambda done, share=share: on_progress(share + done / len(config.relevances)),  # type: ignore[misc]
+        map_builds[name] = build(
+            *(plan, training, landmarks, landmark_source, config.n_landmarks, evaluator),
+            lambda build_share, share=share: on_progress(share + build_share / len(config.relevances)),  # type: ignore[misc]
             fitter=fitter,
         )
         if name is not Relevance.COMPOSED:
-            model = built[name].map.landmark_model
-    return built
+            model = map_builds[name].map.landmark_model
+    return map_builds
 
 
-def listed_anew(built: Built, list_length: int) -> Map:
-    """The map with lists of another length, and landmarks moved for them: single views are compared by no more."""
-    map_ = built.map
-    if map_.relevance is Relevance.COMPOSED and built.places is not None and built.initial_landmarks is not None:
-        prototypes = learnt_landmarks(built.places, built.initial_landmarks, list_length)
-        lists = compose(built.places, prototypes, list_length)
+def relisted_map(map_build: Built, list_length: int) -> Map:
+    """The map with lists of another length and landmarks moved for them, which is all that single views need."""
+    map_ = map_build.map
+    if (
+        map_.relevance is Relevance.COMPOSED
+        and map_build.places is not None
+        and map_build.initial_landmarks is not None
+    ):
+        prototypes = learnt_landmarks(map_build.places, map_build.initial_landmarks, list_length)
+        lists = compose(map_build.places, prototypes, list_length)
         return replace(map_, lists=lists, landmark_model={**map_.landmark_model, "prototypes": prototypes})
-    listed = build_map(map_.relevance, built.map_drive, list_length)
-    return replace(listed, landmark_model=map_.landmark_model, actions_m=map_.actions_m)
+    new_map = build_map(map_.relevance, map_build.map_drive, list_length)
+    return replace(new_map, landmark_model=map_.landmark_model, actions_m=map_.actions_m)
 
 
-class ViewsOf:
+class DriveViews:
     """A test drive's frames as live views, measured once by the landmarks of every model.
 
     Attributes:
@@ -203,47 +207,47 @@ class ViewsOf:
 
     def __init__(self, drive: Drive, evaluator: Evaluator) -> None:
         self.drive, self._evaluator = drive, evaluator
-        self._known: list[tuple[LandmarkModel, Query]] = []
+        self._batches: list[tuple[LandmarkModel, Query]] = []
 
     def by(self, model: LandmarkModel) -> Query:
-        """A batch. Models are the same where their arrays are."""
-        for known, views in self._known:
-            if known.keys() == model.keys() and all(known[name] is model[name] for name in known):
+        """The views measured by a model's landmarks, a batch; models are the same where their arrays are."""
+        for batch_model, views in self._batches:
+            if batch_model.keys() == model.keys() and all(batch_model[name] is model[name] for name in batch_model):
                 return views
         views = views_of(measure_drive(self.drive, model, self._evaluator))
-        self._known.append((model, views))
+        self._batches.append((model, views))
         return views
 
 
 def score_maps(
     config: VprConfig,
-    built: Mapping[Relevance, Built],
-    test: ViewsOf,
+    map_builds: Mapping[Relevance, Built],
+    test: DriveViews,
     truths: Sequence[Sequence[NDArray[np.int64]]],
     progress: Progress,
     *,
     bound: bool = True,
 ) -> list[dict[str, RetrievalScores]]:
-    """Scores by relevance, and of what rivals `composed`, for each of several truths.
+    """Scores by relevance, and by rival of `composed`, for each of several truths.
 
     Args:
-        truths: For every test frame the map images that count as true; as often as somebody sees that otherwise.
+        truths: Every one holds for every test frame the map images that count as true.
         bound: Whether `brute_force_u` is scored too, beside `composed`.
     """
     scores: list[dict[str, RetrievalScores]] = [{} for _ in truths]
 
     def keep(name: str, rows: Iterable[NDArray[np.floating]]) -> None:
-        for each, score in zip(scores, _scores(rows, truths), strict=True):
-            each[name] = score
+        for truth_scores, score in zip(scores, _scores(rows, truths), strict=True):
+            truth_scores[name] = score
 
     for name in config.relevances:
         progress.stage(f"query by {name.value}")
-        map_ = built[name].map
+        map_ = map_builds[name].map
         views, moved_m = test.by(map_.landmark_model), moves_between(test.drive)
         live = None if config.stateless else map_.live_statistics
         keep(name.value, _relevances_in_order(map_, views, live, moved_m, progress.update))
         if name is Relevance.COMPOSED and bound:
-            keep(BRUTE_FORCE_U, relevances_by_all(built[name], views, moved_m, config.stateless))
+            keep(BRUTE_FORCE_U, relevances_by_all(map_builds[name], views, moved_m, config.stateless))
     return scores
 
 
@@ -258,21 +262,21 @@ def _scores(
 
 
 def bytes_per_encoding(drive: Drive) -> int:
-    """Of a frame in a traverse's file."""
+    """The bytes that one frame's encoding takes in a traverse's file."""
     return drive.encoding_dim * (2 if is_halvable(drive.encodings) else 4)
 
 
 def bits_per_map_image(map_: Map) -> float:
     """Write the map to a file, as a remap would, and count the pages of its posting tables."""
     with tempfile.TemporaryDirectory() as folder:
-        building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
+        building, sealed_path = Path(folder) / "1.building", Path(folder) / "1.sqlite"
         write_map(building, map_)
-        seal(building, sealed)
-        return 8 * index_bytes(sealed) / map_.n_images
+        seal(building, sealed_path)
+        return 8 * index_bytes(sealed_path) / map_.n_images
 
 
 def moves_between(drive: Drive) -> list[float | None]:
-    """Metres from the view before to each; None to the first."""
+    """Metres moved to every view from the one before; None for the first."""
     return [None, *np.diff(drive.position_m).tolist()]
 
 
@@ -283,22 +287,22 @@ def _relevances_in_order(
     moved_m: Sequence[float | None],
     on_progress: Callable[[float], None],
 ) -> Iterator[NDArray[np.float32]]:
-    """[n] of every view, one after the other."""
+    """Yield the relevances [n] to every view in order."""
     # Without a session's statistics every view is compared by itself; many at once are one matrix product.
     size = _QUERIES_A_BLOCK if map_.relevance is Relevance.BRUTE_FORCE else 1
     for first in range(0, len(moved_m), size):
-        asked = views.at(slice(first, first + size) if size > 1 else first)
+        query = views.at(slice(first, first + size) if size > 1 else first)
         if live is not None:
-            live, _ = map_.after_view(live, asked, moved_m[first])
-        yield from np.atleast_2d(relevances(map_, asked, live))
+            live, _ = map_.after_view(live, query, moved_m[first])
+        yield from np.atleast_2d(relevances(map_, query, live))
         on_progress(min(1.0, (first + size) / len(moved_m)))
 
 
 def relevances_by_all(
-    built: Built, views: Query, moved_m: Sequence[float | None], stateless: bool
+    map_build: Built, views: Query, moved_m: Sequence[float | None], stateless: bool
 ) -> Iterator[NDArray[np.float32]]:
-    """[n] of every view by what the lists stand for: the same unit vectors, and nothing left out."""
-    map_, places = built.map, built.places
+    """Yield the relevances [n] to every view of the whole unit vectors that the lists stand for."""
+    map_, places = map_build.map, map_build.places
     live, projection = map_.live_statistics, map_.landmark_model.get("projection")
     for number, move_m in enumerate(moved_m):
         view = views.at(number)
