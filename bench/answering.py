@@ -50,25 +50,27 @@ def _retrieval_rows() -> Iterator[list[str]]:
     dissimilarities = rng.random(N_LANDMARKS, dtype=np.float32)
     for n_images in SIZES:
         lists = scattered_lists(n_images)
-        for built in (composed_map(lists), standardised_map(lists), rrf_map(lists)):
+        for map_ in (composed_map(lists), standardised_map(lists), rrf_map(lists)):
             query = Query(rank_landmarks(dissimilarities), dissimilarities)
-            relevance = relevances(built, query)
+            relevance = relevances(map_, query)
 
-            def rank(built: Map = built, query: Query = query) -> None:
-                relevances(built, query)
+            def rank(map_: Map = map_, query: Query = query) -> None:
+                relevances(map_, query)
 
             # Many of our queries for each of brute force: its half gigabyte evicts ours, which real use would not do.
             repeats = 1000 if n_images < 100_000 else 30
             ranking, listing = interleaved([rank, lambda: shortlist(relevance, 10)], repeats, warm_up=5)  # noqa: B023
-            row = [f"{n_images:,}", built.relevance.value, str(ranking), duration(listing.median_s)]
-            row.append(f"{built.lists.nbytes / 1e6:.1f} MB")
+            row = [f"{n_images:,}", map_.relevance.value, str(ranking), duration(listing.median_s)]
+            row.append(f"{map_.lists.nbytes / 1e6:.1f} MB")
             if n_images == NCLT_IMAGES:
                 index = faiss.IndexFlatL2(ENCODING_DIM)
                 for start in range(0, n_images, 4096):
                     index.add(rng.normal(size=(min(4096, n_images - start), ENCODING_DIM)).astype(np.float32))
                 query = rng.normal(size=(1, ENCODING_DIM)).astype(np.float32)
-                ours, theirs = interleaved([lambda: [rank() for _ in range(50)], lambda: index.search(query, 10)], 15)  # noqa: B023
-                yield [*row, duration(theirs.median_s), f"{50 * theirs.median_s / ours.median_s:,.0f}"]
+                calls = [lambda: [rank() for _ in range(50)], lambda: index.search(query, 10)]  # noqa: B023
+                our_timing, faiss_timing = interleaved(calls, 15)
+                ratio = 50 * faiss_timing.median_s / our_timing.median_s
+                yield [*row, duration(faiss_timing.median_s), f"{ratio:,.0f}"]
             else:
                 yield [*row, f"needs {n_images * ENCODING_DIM * 4 / 1e9:.1f} GB", ""]
 
@@ -84,7 +86,7 @@ def step_table() -> Iterator[str]:
 
 def _step_rows() -> Iterator[list[str]]:
     rng = np.random.default_rng(1)
-    built = composed_map(  # its lists drift; what it learnt is random
+    map_ = composed_map(  # its lists drift; what it learnt is random
         dense_lists(NCLT_IMAGES),
         actions_m=np.array(ACTIONS_M),
         view_bits=rng.random(NCLT_IMAGES).astype(np.float32),
@@ -93,14 +95,14 @@ def _step_rows() -> Iterator[list[str]]:
     views = [Query(rng.permutation(N_LANDMARKS).astype(np.float32) + 1) for _ in range(32)]
     for kind in FilterKind:
         for planner in (INFORMED, NNQL):
-            localizer = ActiveLocalizer(built, LocalizerConfig(filter=kind, planner=planner), perf_counter)
+            localizer = ActiveLocalizer(map_, LocalizerConfig(filter=kind, planner=planner), perf_counter)
             state = localizer.start()
             seconds, planning_ms = [], []
             for number in range(N_STEPS + 10):
-                began = perf_counter()
+                start_s = perf_counter()
                 step = localizer.step(state, views[number % len(views)], 1.0)
                 if number >= 10:
-                    seconds.append(perf_counter() - began)
+                    seconds.append(perf_counter() - start_s)
                     planning_ms.append(step.timings_ms["plan"])
                 state = step.state
             yield [kind.value, f"`{planner}`", str(Timing(seconds)), duration(median(planning_ms) / 1000)]

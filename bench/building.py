@@ -52,11 +52,11 @@ def landmark_table() -> Iterator[str]:
     yield from markdown(head, [[*shape, f"{spent['seconds']:.1f}", f"{spent['peak_mb'] / 1e3:.2f} GB"]])
 
 
-def _in_own_process(what: str) -> dict[str, float]:
-    """What `main` prints: its memory can be read off a process of its own alone."""
-    command = [sys.executable, "-m", "bench.building", what]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own interpreter
-    return dict(json.loads(done.stdout))
+def _in_own_process(task: str) -> dict[str, float]:
+    """The figures that `main` prints for a task, in a process of its own, whose peak of memory is the task's."""
+    command = [sys.executable, "-m", "bench.building", task]
+    process = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own interpreter
+    return dict(json.loads(process.stdout))
 
 
 def map_file_table() -> Iterator[str]:
@@ -70,7 +70,7 @@ def map_file_table() -> Iterator[str]:
     }
     with tempfile.TemporaryDirectory() as folder:
         building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
-        yield from markdown(head, (_map_file_row(name, built, building, sealed) for name, built in kinds.items()))
+        yield from markdown(head, (_map_file_row(name, map_, building, sealed) for name, map_ in kinds.items()))
         sizes = sorted(table_bytes(sealed).items(), key=lambda item: -item[1])
     yield ""
     yield "Bits are the `dbstat` pages of the posting table. Tables of the last file, bytes: " + ", ".join(
@@ -78,12 +78,12 @@ def map_file_table() -> Iterator[str]:
     )
 
 
-def _map_file_row(name: str, built: Map, building: Path, sealed: Path) -> list[str]:
-    writing = timed(lambda: write_map(building, built), repeats=3)
+def _map_file_row(name: str, map_: Map, building: Path, sealed: Path) -> list[str]:
+    writing = timed(lambda: write_map(building, map_), repeats=3)
 
     def write_and_seal() -> None:
         sealed.unlink(missing_ok=True)
-        write_map(building, built)
+        write_map(building, map_)
         seal(building, sealed)
 
     sealing_s = timed(write_and_seal, repeats=3).median_s - writing.median_s
@@ -93,12 +93,12 @@ def _map_file_row(name: str, built: Map, building: Path, sealed: Path) -> list[s
     return [name, f"{bits:.1f}", f"{megabytes:.1f} MB", *times]
 
 
-def _with_model(built: Map) -> Map:
-    """With a landmark model of the paper's size."""
+def _with_model(map_: Map) -> Map:
+    """A map with a landmark model of the paper's size."""
     prototypes = np.random.default_rng(0).normal(size=(N_LANDMARKS, ENCODING_DIM)).astype(np.float32)
-    actions_m = np.ones(1) if built.q_values is None else built.actions_m
+    actions_m = np.ones(1) if map_.q_values is None else map_.actions_m
     evaluator = {"kind": "feature_l2"}
-    return replace(built, evaluator=evaluator, actions_m=actions_m, landmark_model={"prototypes": prototypes})
+    return replace(map_, evaluator=evaluator, actions_m=actions_m, landmark_model={"prototypes": prototypes})
 
 
 def composed_table() -> Iterator[str]:
@@ -109,9 +109,9 @@ def composed_table() -> Iterator[str]:
     places, landmarks = (unit(rng.normal(size=(count, MOST_DIMENSIONS))) for count in (NCLT_IMAGES, N_LANDMARKS))
     listing = timed(lambda: compose(places, landmarks, 4), repeats=3, warm_up=1)
     view_bits = rng.random(NCLT_IMAGES).astype(np.float32)
-    built = rrf_map(dense_lists(NCLT_IMAGES), actions_m=np.array(ACTIONS_M), view_bits=view_bits)
+    map_ = rrf_map(dense_lists(NCLT_IMAGES), actions_m=np.array(ACTIONS_M), view_bits=view_bits)
     prices = iter(np.arange(1, 100) / 1000)  # a price that was asked before is kept
-    planning = timed(lambda: information_ahead(built, float(next(prices))), repeats=9)
+    planning = timed(lambda: information_ahead(map_, float(next(prices))), repeats=9)
     yield f"Lists of `composed`: {listing}. The table of `informed`, once a map and price: {planning}."
 
 
@@ -156,24 +156,24 @@ def _selection() -> dict[str, float]:
         block = rng.standard_normal((1000, ENCODING_DIM), dtype=np.float32)
         candidates[start : start + 1000] = block / np.linalg.norm(block, axis=1, keepdims=True)
     select_landmarks(candidates[:2000], 10)  # compiles
-    began = perf_counter()
+    start_s = perf_counter()
     select_landmarks(candidates, N_LANDMARKS)
-    return {"seconds": perf_counter() - began}
+    return {"seconds": perf_counter() - start_s}
 
 
 def _training(relevance: Relevance) -> dict[str, float]:
-    """On a live drive that resembles the places it passes."""
+    """Seconds of training on a live drive that resembles the places it passes."""
     config = NnqlConfig()
-    built, views = _composed() if relevance is Relevance.COMPOSED else _listed(relevance)
-    world = TrainingWorld.on(built, views, built.route, np.arange(NCLT_IMAGES), config)
+    map_, views = _composed_map() if relevance is Relevance.COMPOSED else _map_of_lists(relevance)
+    world = TrainingWorld.on(map_, views, map_.route, np.arange(NCLT_IMAGES), config)
     with ThreadPoolExecutor(2) as pool:
         train(world, replace(config, n_episodes=100), lambda _: None, pool)  # compiles
-        began, began_processor = perf_counter(), process_time()
+        start_s, start_processor_s = perf_counter(), process_time()
         train(world, config, lambda _: None, pool)
-        return {"seconds": perf_counter() - began, "processor_seconds": process_time() - began_processor}
+        return {"seconds": perf_counter() - start_s, "processor_seconds": process_time() - start_processor_s}
 
 
-def _listed(relevance: Relevance) -> tuple[Map, Query]:
+def _map_of_lists(relevance: Relevance) -> tuple[Map, Query]:
     lists = dense_lists(NCLT_IMAGES)
     level = np.random.default_rng(0).random((NCLT_IMAGES, N_LANDMARKS), np.float32)
     level[np.arange(NCLT_IMAGES), lists] *= 0.2
@@ -183,17 +183,17 @@ def _listed(relevance: Relevance) -> tuple[Map, Query]:
     return make(lists, actions_m=np.array(ACTIONS_M)), Query(ranks)
 
 
-def _composed() -> tuple[Map, Query]:
-    """Of a drive with itself for landmarks, and another that passes the same places."""
+def _composed_map() -> tuple[Map, Query]:
+    """A map of a drive with landmarks of its own, and the views of another drive that passes the same places."""
     rng, evaluator = np.random.default_rng(0), FeatureL2("none")
     places = np.cumsum(rng.normal(size=(NCLT_IMAGES, _DIM)), axis=0)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     seasons = (places + 0.5 / np.sqrt(_DIM) * rng.normal(size=places.shape) for _ in range(2))
-    own, other = (
+    drive, live_drive = (
         Drive(position_m=np.arange(NCLT_IMAGES) * SPACING_M, encodings=season.astype(np.float32)) for season in seasons
     )
-    built = build(MapPlan(Relevance.COMPOSED, 4, ACTIONS_M), own, None, own, N_LANDMARKS, evaluator).map
-    return built, views_of(measure_drive(other, built.landmark_model, evaluator))
+    map_ = build(MapPlan(Relevance.COMPOSED, 4, ACTIONS_M), drive, None, drive, N_LANDMARKS, evaluator).map
+    return map_, views_of(measure_drive(live_drive, map_.landmark_model, evaluator))
 
 
 if __name__ == "__main__":

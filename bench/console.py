@@ -44,27 +44,27 @@ def lines() -> Iterator[str]:
             robot.sees()
         url = f"{server.url}/console"
         limits = []
-        for name, where, text in (
+        for name, fragment, text in (
             ("the domain", "#domains/bench", "Map versions"),
             ("a session", f"#sessions/{session_id}", f"After {_N_BEFORE} views"),
         ):
-            painted, drawn = zip(*(_opened(browser, url + where, text) for _ in range(_N_OPENED)), strict=True)
+            painted, drawn = zip(*(_opening_s(browser, url + fragment, text) for _ in range(_N_OPENED)), strict=True)
             limits.append(Limit(f"{name}: first contentful paint, s", float(np.median(painted)), _FIRST_PAINT_S))
             limits.append(Limit(f"{name}: all drawn, s", float(np.median(drawn)), _FIRST_PAINT_S))
-        limits += _driven(browser, f"{url}#sessions/{session_id}", robot)
+        limits += _update_limits(browser, f"{url}#sessions/{session_id}", robot)
         browser.close()
     yield from limit_table(limits)
     if (missed := breaches(limits)) is not None:
         yield from ("", missed)
 
 
-def _opened(browser: Any, url: str, text: str) -> tuple[float, float]:
+def _opening_s(browser: Any, url: str, text: str) -> tuple[float, float]:
     """Seconds to the first contentful paint, and to the text that comes last."""
     page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     page.goto(url)
     page.get_by_text(text).first.wait_for()
-    drawn_s = time.perf_counter() - began
+    drawn_s = time.perf_counter() - start_s
     painted = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
     painted_s = page.evaluate(painted) / 1000
     page.context.close()
@@ -72,7 +72,7 @@ def _opened(browser: Any, url: str, text: str) -> tuple[float, float]:
 
 
 class _Robot:
-    """A metre a view, each of another place."""
+    """A robot that moves a metre a view, and sees another place in each."""
 
     def __init__(self, url: str, session_id: str) -> None:
         self._url, self._path = url, f"/v1/sessions/{session_id}/observations?action_m=1"
@@ -85,24 +85,24 @@ class _Robot:
             link.ask("POST", self._path, body, {"Content-Type": JSON})
 
 
-def _driven(browser: Any, url: str, robot: _Robot) -> list[Limit]:
-    """What updates cost the page, of a robot that sends ten views a second."""
+def _update_limits(browser: Any, url: str, robot: _Robot) -> list[Limit]:
+    """Limits of what updates cost the page, from a robot that sends ten views a second."""
     page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
     page.goto(url)
     page.get_by_text(f"After {_N_BEFORE} views").first.wait_for()
     browser.start_tracing(page=page, categories=["toplevel", "devtools.timeline"])
     inspector = page.context.new_cdp_session(page)
     inspector.send("Performance.enable", {"timeDomain": "threadTicks"})
-    taken: list[dict[str, float]] = []
+    metrics: list[dict[str, float]] = []
     for update in range(-_N_WARM_UP, _N_UPDATES):
         if update == 0:
-            taken.append(_spent(inspector))
+            metrics.append(_spent(inspector))
         due = time.perf_counter() + _EVERY_S
         robot.sees()
         page.wait_for_timeout(max(0.0, 1000 * (due - time.perf_counter())))
     page.get_by_text(f"After {_N_BEFORE + _N_WARM_UP + _N_UPDATES} views").first.wait_for()
-    taken.append(_spent(inspector))
-    spent = {name: 1000 * (taken[1][name] - taken[0][name]) / _N_UPDATES for name in taken[0]}
+    metrics.append(_spent(inspector))
+    spent = {name: 1000 * (metrics[1][name] - metrics[0][name]) / _N_UPDATES for name in metrics[0]}
     longest_ms = _longest_task_ms(json.loads(browser.stop_tracing())["traceEvents"])
     page.context.close()
     return [
@@ -114,8 +114,10 @@ def _driven(browser: Any, url: str, robot: _Robot) -> list[Limit]:
 
 def _longest_task_ms(events: list[dict[str, Any]]) -> float:
     """Processor time of the longest task of the thread that runs the console's scripts, which paints it too."""
-    ours = {(e["pid"], e["tid"]) for e in events if e["name"] == "FunctionCall" and "/console/" in json.dumps(e)}
-    tasks = [e for e in events if e["name"].endswith("RunTask") and (e["pid"], e["tid"]) in ours]
+    page_threads = {
+        (e["pid"], e["tid"]) for e in events if e["name"] == "FunctionCall" and "/console/" in json.dumps(e)
+    }
+    tasks = [e for e in events if e["name"].endswith("RunTask") and (e["pid"], e["tid"]) in page_threads]
     return float(max(e.get("tdur", 0) for e in tasks) / 1000)
 
 

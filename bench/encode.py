@@ -48,13 +48,13 @@ def pictures(n: int) -> list[bytes]:
 
 
 def medians_ms(work: dict[str, Callable[[], object]], rounds: int = 60) -> dict[str, float]:
-    """Milliseconds of each, measured in turn."""
+    """Median milliseconds of every piece of work, measured in turn."""
     timings = interleaved(list(work.values()), rounds, warm_up=5)
     return {name: 1000 * timing.median_s for name, timing in zip(work, timings, strict=True)}
 
 
 def by_runtime(bodies: list[bytes]) -> Iterator[str]:
-    """From JPEG to encoding, whole and in parts."""
+    """Lines on the time from JPEG to encoding, whole and in parts, by runtime."""
     yield from ("## One image, 640 x 480 JPEG to encoding", "")
     images, rows = [decode_image(body, 10**7) for body in bodies], []
     exact = make_extractor("efficientnet_lite0", Compute(runtime=Runtime.TORCH)).encode(images)
@@ -67,10 +67,10 @@ def by_runtime(bodies: list[bytes]) -> Iterator[str]:
             "network": lambda network=network, prepared=prepared: network.encode(prepared),
             "bare": _bare(network.run, np.stack(prepared)),
         }
-        whole, through, bare = medians_ms(work).values()
+        whole_ms, network_ms, bare_ms = medians_ms(work).values()
         cosine = float(np.einsum("nd,nd->n", extractor.encode(images), exact).min())
-        share = f"{100 * bare / through:.0f} %"
-        rows.append([runtime.value, f"{whole:.1f}", f"{through:.1f}", f"{bare:.1f}", share, f"{cosine:.5f}"])
+        share = f"{100 * bare_ms / network_ms:.0f} %"
+        rows.append([runtime.value, f"{whole_ms:.1f}", f"{network_ms:.1f}", f"{bare_ms:.1f}", share, f"{cosine:.5f}"])
     times = ("whole, ms", "the network through the extractor, ms", "the bare runtime, ms")
     yield from markdown(("runtime", *times, "of its throughput", "cosine with torch, least"), rows)
     yield ""
@@ -81,17 +81,17 @@ def _bare(run: object, pixels: np.ndarray) -> Callable[[], object]:
     if hasattr(run, "_session"):
         session = run._session
         return lambda: session.run(None, {"pixels": pixels})
-    module, shown = run._module, torch.from_numpy(pixels)  # type: ignore[attr-defined]
+    module, tensor = run._module, torch.from_numpy(pixels)  # type: ignore[attr-defined]
 
     def call() -> object:
         with torch.inference_mode():
-            return module(shown)
+            return module(tensor)
 
     return call
 
 
 def in_parts(bodies: list[bytes]) -> Iterator[str]:
-    """Where the rest of the time goes."""
+    """Lines on the time of the steps around the network."""
     image = decode_image(bodies[0], 10**7)
     upright, small, gradients = np.ascontiguousarray(image), resized(image, (224, 224)), GradientGrid()
     took = medians_ms(
@@ -107,14 +107,16 @@ def in_parts(bodies: list[bytes]) -> Iterator[str]:
 
 
 def batches() -> Iterator[str]:
-    """What a larger batch is worth on this machine."""
+    """Lines on what a larger batch is worth on this machine."""
     yield from ("## Batches", "", "Milliseconds an image, the network through the extractor:", "")
     pixels, rows = [np.random.default_rng(k).integers(0, 256, (224, 224, 3), np.uint8) for k in range(16)], []
     for runtime in RUNTIMES:
         computes = [Compute(runtime=runtime, largest_batch=n_images) for n_images in (1, 2, 4, 8, 16)]
         networks = [make_extractor("efficientnet_lite0", compute)._network for compute in computes]  # type: ignore[attr-defined]
         runs = [lambda network=network: network.encode(pixels) for network in networks]
-        rows.append([runtime.value, *(f"{1000 * each.median_s / 16:.1f}" for each in interleaved(runs, 8, warm_up=5))])
+        rows.append(
+            [runtime.value, *(f"{1000 * timing.median_s / 16:.1f}" for timing in interleaved(runs, 8, warm_up=5))]
+        )
     yield from markdown(("runtime", "1", "2", "4", "8", "16"), rows)
     yield from (
         "",
@@ -126,8 +128,8 @@ def batches() -> Iterator[str]:
 
 
 def robots(bodies: list[bytes]) -> Iterator[str]:
-    """Sixteen robots against one service, beside what the same machine encodes with nothing around it."""
-    own = _own_rate(bodies)
+    """Lines on sixteen robots against one service, beside what the same machine encodes without one."""
+    loop_rate = _own_rate(bodies)
     with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
         with Link(server.url) as link:
             link.ask("PUT", f"/v1/admin/domains/{_DOMAIN}", {"evaluator": {"kind": "feature_l2"}})
@@ -143,9 +145,9 @@ def robots(bodies: list[bytes]) -> Iterator[str]:
 
         drive(server.url, crowd[:1], is_over)  # warms up
         (alone,) = drive(server.url, crowd[:1], is_over)
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         together = drive(server.url, crowd, is_over)
-        rate = N_ROBOTS * N_VIEWS / (time.perf_counter() - began)
+        rate = N_ROBOTS * N_VIEWS / (time.perf_counter() - start_s)
     if failures := [failure for waits in together for failure in waits.failures]:
         raise RuntimeError(f"not every image was answered: {failures}")
     rates = [N_VIEWS / sum(waits.seconds) for waits in together]
@@ -158,8 +160,8 @@ def robots(bodies: list[bytes]) -> Iterator[str]:
         "",
     )
     rows = {
-        "the same JPEGs in a loop without a service, decoding a batch ahead": f"{own:.0f} images a second",
-        f"{N_ROBOTS} robots over HTTP": f"{rate:.0f} answers a second, {100 * rate / own:.0f} % of that",
+        "the same JPEGs in a loop without a service, decoding a batch ahead": f"{loop_rate:.0f} images a second",
+        f"{N_ROBOTS} robots over HTTP": f"{rate:.0f} answers a second, {100 * rate / loop_rate:.0f} % of that",
         "a robot's own rate, slowest and fastest": f"{min(rates):.1f} and {max(rates):.1f} a second",
         "time of an answer, median and p99": f"{spread[0]:.0f} and {spread[1]:.0f} ms",
         "one robot alone, median and p99": f"{alone_ms[0]:.1f} and {alone_ms[1]:.1f} ms",
@@ -193,7 +195,7 @@ def _own_rate(bodies: list[bytes]) -> float:
 
 
 def starts() -> Iterator[str]:
-    """From the command to `/readyz`, with a domain of the default extractor there."""
+    """Lines on the time from the command to `/readyz`, with a domain of the default extractor."""
     yield from ("## Start", "")
     imported_s, rows = {}, []
     for name in ("torch", "onnxruntime", "sys"):
@@ -206,9 +208,9 @@ def starts() -> Iterator[str]:
                 client.admin.put_domain(_DOMAIN, {"kind": "feature_l2"})
             seconds = []
             for _ in range(5):
-                began = time.perf_counter()
+                start_s = time.perf_counter()
                 server.start()
-                seconds.append(time.perf_counter() - began)
+                seconds.append(time.perf_counter() - start_s)
                 server.stop()
         rows.append((f"{Timing(seconds).median_s:.2f}", runtime.value))
     yield from markdown(("to `/readyz`, median of five, s", "runtime"), rows)

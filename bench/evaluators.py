@@ -47,7 +47,7 @@ L2_IN_OWN_SPACE = "feature_l2, in its own space"
 
 
 class OwnSpaceL2(Trunk):
-    """Squared L2 of encodings taken as if it were any dissimilarity: what decision 0029 costs by itself."""
+    """Squared L2 of encodings treated as any other dissimilarity, to tell what decision 0029 costs by itself."""
 
     kind = "l2"
     fitting = Fitting.NOTHING  # type: ignore[assignment]
@@ -65,22 +65,22 @@ class OwnSpaceL2(Trunk):
 class Kind:
     """A line of a table."""
 
-    make: Callable[[str], Evaluator]  # of an extractor's name
-    encodings: tuple[str, ...] = ("feature_l2",)  # whose lie side by side
-    alone: int | None = None  # which of these a view brings; None: all
+    make: Callable[[str], Evaluator]  # from an extractor's name
+    encodings: tuple[str, ...] = ("feature_l2",)  # kinds whose encodings lie side by side
+    alone: int | None = None  # index of the one kind that a view brings; None: all
 
 
 def fused(half: str, alone: int | None = None) -> Kind:
-    """Images, and what is told."""
+    """Images fused with another half; `alone` as in `Kind`."""
     of = [{"kind": "feature_l2"}, {"kind": half}]
     return Kind(lambda _: make_evaluator(evaluator_config({"kind": "fused", "of": of})), ("feature_l2", half), alone)
 
 
 KINDS: Mapping[str, Kind] = {
-    "feature_l2": Kind(lambda extractor: made("feature_l2", extractor)),
+    "feature_l2": Kind(lambda extractor: evaluator_of("feature_l2", extractor)),
     L2_IN_OWN_SPACE: Kind(OwnSpaceL2),
-    "siamese": Kind(lambda extractor: made("siamese", extractor)),
-    "autoencoder": Kind(lambda extractor: made("autoencoder", extractor)),
+    "siamese": Kind(lambda extractor: evaluator_of("siamese", extractor)),
+    "autoencoder": Kind(lambda extractor: evaluator_of("autoencoder", extractor)),
 }
 TOLD: Mapping[str, Kind] = {  # of the campus, which tells what it shows
     "objects": Kind(lambda _: make_evaluator(evaluator_config({"kind": "objects"})), ("objects",)),
@@ -92,7 +92,7 @@ TOLD: Mapping[str, Kind] = {  # of the campus, which tells what it shows
     "fused: L2, language; views of images alone": fused("language", 0),
     "fused: L2, language; views of texts alone": fused("language", 1),
 }
-# A line, and those of which it should be no worse than the better
+# A line, and the lines than the better of which it should be no worse
 AGAINST = {
     "siamese": ("feature_l2",),
     "autoencoder": ("feature_l2",),
@@ -105,13 +105,13 @@ AGAINST = {
 }
 
 
-def made(kind: str, extractor: str) -> Evaluator:
-    """An evaluator by its names."""
+def evaluator_of(kind: str, extractor: str) -> Evaluator:
+    """The evaluator of a kind with an extractor."""
     return make_evaluator(evaluator_config({"kind": EvaluatorKind(kind).value, "extractor": extractor}))
 
 
 class KeptPictures(RecordingPictures):
-    """A recording's, whose views are kept in a file too."""
+    """A recording's pictures, whose views are kept in a file too."""
 
     def __init__(self, recording: Recording, file: Path) -> None:
         super().__init__(recording, MAX_PIXELS)
@@ -121,10 +121,10 @@ class KeptPictures(RecordingPictures):
                 self._views = {int(name): views[name].astype(np.float32) for name in views.files}
 
     def keep_views(self, views: dict[int, NDArray[np.float32]]) -> None:
-        """Write all anew, now and then."""
+        """Keep views in memory, and write all to the file after every `N_LANDMARKS` of them."""
         super().keep_views(views)
         if len(self._views) % N_LANDMARKS == 0:
-            np.savez(self._file, **{str(index): each.astype(np.float16) for index, each in self._views.items()})
+            np.savez(self._file, **{str(index): rows.astype(np.float16) for index, rows in self._views.items()})
 
 
 @dataclass(frozen=True)
@@ -147,26 +147,26 @@ class Trial:
     ground_truth: Path | None = None
 
     def scored(self, kind: Kind) -> Scored:
-        """What an evaluator scores, one session over the test drive."""
+        """The scores of an evaluator, in one session over the test drive."""
         training, test = (self.drives.of(source, kind) for source in (self.training, self.test))
-        known = None if self.landmarks is None else self.drives.of(self.landmarks, kind)
+        landmark_drive = None if self.landmarks is None else self.drives.of(self.landmarks, kind)
         if kind.alone is not None:
             first = self.drives.of(self.test, KINDS["feature_l2"]).encoding_dim
             encodings = test.encodings.copy()
             encodings[:, slice(first, None) if kind.alone == 0 else slice(first)] = 0
             test = replace(test, encodings=encodings)
-        config = VprConfig(min(N_LANDMARKS, (known or training).n_frames), relevances=COMPARED)
+        config = VprConfig(min(N_LANDMARKS, (landmark_drive or training).n_frames), relevances=COMPARED)
         evaluator = kind.make(self.drives.extractor)
-        built = build_maps(config, Fitter(evaluator, self._pictures, config.seed), evaluator, known, training)
+        maps = build_maps(config, Fitter(evaluator, self._pictures, config.seed), evaluator, landmark_drive, training)
         truth = (
             true_images_of(test.route(), training.route(), config.tolerance_m)
             if self.ground_truth is None
             else read_ground_truth(self.ground_truth, test.index, training.index)
         )
         progress, views = Progress(vpr_stages(config)), DriveViews(test, evaluator)
-        scores = score_maps(config, built, views, [truth], progress, bound=False)[0]
-        block = (test.position_m[[each.size > 0 for each in truth]] // BLOCK_M).astype(np.int64)
-        return Scored(scores, block, built[DEFAULT_RELEVANCE].fitting)
+        scores = score_maps(config, maps, views, [truth], progress, bound=False)[0]
+        block = (test.position_m[[images.size > 0 for images in truth]] // BLOCK_M).astype(np.int64)
+        return Scored(scores, block, maps[DEFAULT_RELEVANCE].fitting)
 
     @cached_property
     def _pictures(self) -> "KeptPictures | None":
@@ -179,14 +179,14 @@ class Trial:
         model = evaluator.fit(Lesson(drive.encodings, rows)).model
         seconds = []
         for row in range(12):
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             evaluator.dissimilarities(drive.encodings[row : row + 1], model)
-            seconds.append(time.perf_counter() - began)
+            seconds.append(time.perf_counter() - start_s)
         return float(np.median(seconds[2:]))
 
 
 class Drives:
-    """Recordings by source, each encoded once, what was encoded kept in a folder."""
+    """Recordings by source, each encoded once; encodings are kept in a folder."""
 
     def __init__(self, work: Path, extractor: str = "efficientnet_lite0") -> None:
         self._work, self.extractor = work, extractor
@@ -194,8 +194,8 @@ class Drives:
 
     def of(self, source: str, kind: Kind) -> Drive:
         """A drive by the encodings of a kind."""
-        first, *others = (self._by(source, name) for name in kind.encodings)
-        return replace(first, encodings=np.hstack([first.encodings, *(other.encodings for other in others)]))
+        first, *other_drives = (self._by(source, name) for name in kind.encodings)
+        return replace(first, encodings=np.hstack([first.encodings, *(other.encodings for other in other_drives)]))
 
     def _by(self, source: str, name: str) -> Drive:
         if (source, name) not in self._encoded:
@@ -203,14 +203,16 @@ class Drives:
             evaluator = KINDS[name].make(self.extractor) if is_l2 else TOLD[name].make(name)
             made_of = {"extractor": self.extractor} if is_l2 else {"kind": name}
             role = _name(source) + ("" if is_l2 else f"-{name}")
-            with open_encoding_cache(self._work, role, source=source, **made_of) as kept:
+            with open_encoding_cache(self._work, role, source=source, **made_of) as encoding_cache:
                 recording = open_source(source)
-                encoded = encode_recording(recording, evaluator, MAX_PIXELS, lambda _: None, encoding_cache=kept)
+                encoded = encode_recording(
+                    recording, evaluator, MAX_PIXELS, lambda _: None, encoding_cache=encoding_cache
+                )
             self._encoded[source, name] = encoded.drive
         return self._encoded[source, name]
 
     def pictures(self, source: str) -> KeptPictures:
-        """Its images."""
+        """The images of a recording."""
         return KeptPictures(open_source(source), self._work / f"{_name(source)}-views.npz")
 
 
@@ -272,42 +274,42 @@ def lines(work: Path, names: list[str]) -> Iterator[str]:
         yield from markdown(
             ("evaluator", *(relevance.value for relevance in COMPARED)),
             (
-                (kind, *(difference(relevance.value, results, kind, beside) for relevance in COMPARED))
-                for kind, beside in AGAINST.items()
+                (kind, *(difference(relevance.value, results, kind, rivals) for relevance in COMPARED))
+                for kind, rivals in AGAINST.items()
                 if kind in results
             ),
         )
 
 
 def row(trials: list[Trial], kind: tuple[str, Kind], results: dict[str, list[Scored]]) -> tuple[str, ...]:
-    """One evaluator's figures, which `results` takes."""
-    name, one = kind
-    scored = results[name] = [trial.scored(one) for trial in trials]
-    cells = [figures([each.scores[relevance.value] for each in scored]) for relevance in COMPARED]
-    fits = [each.fitting for each in scored if each.fitting is not None]
+    """The cells of one evaluator, whose results are added to `results`."""
+    name, row_kind = kind
+    scored = results[name] = [trial.scored(row_kind) for trial in trials]
+    cells = [figures([result.scores[relevance.value] for result in scored]) for relevance in COMPARED]
+    fits = [result.fitting for result in scored if result.fitting is not None]
     fitted = held_out = "-"
     if fits:
         fitted = f"{np.mean([fit['seconds'] for fit in fits]):.1f} s, {fits[0]['n_dissimilarities']:,} dissimilarities"
-        both = [[fit["held_out"][of]["anr"] or np.nan for fit in fits] for of in (name, "l2")]
-        held_out = f"{np.nanmean(both[0]):.2f} ({np.nanmean(both[1]):.2f})"
-    return name, *cells, fitted, held_out, duration(trials[0].view_s(one)) if one.alone is None else "-"
+        anrs = [[fit["held_out"][of]["anr"] or np.nan for fit in fits] for of in (name, "l2")]
+        held_out = f"{np.nanmean(anrs[0]):.2f} ({np.nanmean(anrs[1]):.2f})"
+    return name, *cells, fitted, held_out, duration(trials[0].view_s(row_kind)) if row_kind.alone is None else "-"
 
 
 def figures(scores: list[RetrievalScores]) -> str:
-    """Means, and every ANR."""
+    """The means of ANR and R@1, and in brackets ANR by triplet."""
     anr = [score.anr for score in scores]
     mean = f"{np.mean(anr):.2f} / {np.mean([score.recall_at[1] for score in scores]):.0f}"
-    return mean if len(anr) == 1 else f"{mean} ({', '.join(f'{each:.2f}' for each in anr)})"
+    return mean if len(anr) == 1 else f"{mean} ({', '.join(f'{value:.2f}' for value in anr)})"
 
 
-def difference(relevance: str, results: Mapping[str, list[Scored]], kind: str, beside: tuple[str, ...]) -> str:
-    """Mean difference in ANR of the same queries, with its interval."""
+def difference(relevance: str, results: Mapping[str, list[Scored]], kind: str, rivals: tuple[str, ...]) -> str:
+    """Mean difference in ANR of the same queries from the best rival's, with its 95 % interval."""
     ranks = {
-        name: np.concatenate([100 * each.scores[relevance].normalised_ranks for each in results[name]])
-        for name in (kind, *beside)
+        name: np.concatenate([100 * result.scores[relevance].normalised_ranks for result in results[name]])
+        for name in (kind, *rivals)
     }
-    better = min(beside, key=lambda name: float(ranks[name].mean()))
-    block = np.concatenate([10_000 * number + each.block for number, each in enumerate(results[kind])])
+    better = min(rivals, key=lambda name: float(ranks[name].mean()))
+    block = np.concatenate([10_000 * number + result.block for number, result in enumerate(results[kind])])
     low, high = mean_interval(ranks[kind] - ranks[better], 0, block)
     return f"{ranks[kind].mean() - ranks[better].mean():+.2f} ({low:+.2f} .. {high:+.2f}) from `{better}`"
 

@@ -38,7 +38,7 @@ class Split:
     training: str
     test: str
     n_landmarks: int
-    more: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
 
 
 def railway(data: Path, work: Path) -> Iterator[Split]:
@@ -46,16 +46,23 @@ def railway(data: Path, work: Path) -> Iterator[Split]:
     summer, winter = data / "nordland" / "summer", data / "nordland" / "winter"
     drives = {}
     for half, numbers in (("first", range(1000)), ("second", range(1000, 2000))):
-        kept = kept_frames((summer, winter), numbers)
+        frames = kept_frames((summer, winter), numbers)
         for season in (summer, winter):
-            drives[season.name, half] = str(season_folder(work / f"{season.name}-{half}", season, kept, numbers.start))
-    for group, mapped, live, half, other in (
+            drives[season.name, half] = str(
+                season_folder(work / f"{season.name}-{half}", season, frames, numbers.start)
+            )
+    for group, map_season, live_season, half, other in (
         ("railway, map summer 0..999, live winter", "summer", "winter", "first", "second"),
         ("railway, map summer 1000..1999, live winter", "summer", "winter", "second", "first"),
         ("railway, map winter 0..999, live summer", "winter", "summer", "first", "second"),
     ):
         yield Split(
-            group, drives[mapped, other], drives[mapped, half], drives[live, half], N_LANDMARKS, ("--no-same-route",)
+            group,
+            drives[map_season, other],
+            drives[map_season, half],
+            drives[live_season, half],
+            N_LANDMARKS,
+            ("--no-same-route",),
         )
 
 
@@ -66,18 +73,18 @@ def corridor(data: Path) -> Iterator[Split]:
         data / "corridor" / "query",
         data / "corridor" / "ground_truth_new.npy",
     )
-    for mapped, other in (("0:56", "56:111"), ("56:111", "0:56")):
-        n_landmarks = 55 if other == "56:111" else 56
-        more = ("--ground-truth", str(accepted))
-        yield Split("corridor halves", f"{ref}#{other}", f"{ref}#{mapped}", str(query), n_landmarks, more)
+    for map_half, landmark_half in (("0:56", "56:111"), ("56:111", "0:56")):
+        n_landmarks = 55 if landmark_half == "56:111" else 56
+        options = ("--ground-truth", str(accepted))
+        yield Split("corridor halves", f"{ref}#{landmark_half}", f"{ref}#{map_half}", str(query), n_landmarks, options)
 
 
 def campus(work: Path) -> Iterator[Split]:
     """The client's rendered campus in three seasons, all six triplets; the landmark drive is of the same route."""
     drives = [_as_sent(work, source) for source in write_campus(work, CAMPUS_SEASONS, 300, 0)]
     for landmarks, training, test in itertools.permutations(drives):
-        more = ("--tolerance", str(CAMPUS_TOLERANCE_M))
-        yield Split("campus, six triplets", landmarks, training, test, N_CAMPUS_LANDMARKS, more)
+        options = ("--tolerance", str(CAMPUS_TOLERANCE_M))
+        yield Split("campus, six triplets", landmarks, training, test, N_CAMPUS_LANDMARKS, options)
 
 
 def _as_sent(work: Path, source: str) -> str:
@@ -98,7 +105,7 @@ def documents(split: Split, work: Path) -> dict[str, Any]:
     sources = ("--landmarks", split.landmarks, "--training", split.training, "--test", split.test)
     relevances = ("--relevance", "composed", "--relevance", "rrf", "--relevance", "brute_force")
     counted = ("--n-landmarks", str(split.n_landmarks), "--json", str(into))
-    if code := run(["experiment", "vpr", *sources, *relevances, *counted, "--evaluator", "all", *split.more]):
+    if code := run(["experiment", "vpr", *sources, *relevances, *counted, "--evaluator", "all", *split.options]):
         raise RuntimeError(f"the experiment on {split.group} ended with exit code {code}")
     return dict(json.loads(into.read_text(encoding="utf-8"))["extractors"])
 

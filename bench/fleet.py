@@ -41,16 +41,16 @@ class Run:
     """What the robots of one service met with.
 
     Attributes:
-        seconds: Of every observation until it was acknowledged, repeats counted.
-        told: By robot, session and view, the digest of what was answered.
+        seconds: From every observation to its acknowledgement, repeats counted.
+        digests: By robot, session and view, the digest of the answer.
         refusals: Documented ones, by code.
         faults: Everything else that should not be.
-        alone_s: Of one robot while nobody else asks, before.
-        n_kills: Of replicas.
+        alone_s: Seconds of every answer to one robot before the others start.
+        n_kills: Replicas killed.
     """
 
     seconds: list[float] = field(default_factory=list)
-    told: dict[tuple[int, int, int], str] = field(default_factory=dict)
+    digests: dict[tuple[int, int, int], str] = field(default_factory=dict)
     refusals: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
     alone_s: list[float] = field(default_factory=list)
@@ -82,20 +82,20 @@ def drive(url: str, run: Run, number: int, n_domains: int, every_s: float, stopp
                 if stopped.is_set():
                     return
                 ranks = np.random.default_rng([number, n_session, view]).permutation(N_LANDMARKS).tolist()
-                began = time.perf_counter()
+                start_s = time.perf_counter()
                 path = f"/v1/sessions/{session['session_id']}/observations?action_m=1"
                 answer = ask("POST", path, {"ranked_landmarks": ranks}, f"{view}")
-                run.seconds.append(time.perf_counter() - began)
+                run.seconds.append(time.perf_counter() - start_s)
                 if answer["n_observations"] != view + 1:
                     run.faults.append(f"view {view + 1} was counted as {answer['n_observations']}")
-                run.told[number, n_session, view] = digest(answer)
-                time.sleep(max(0.0, every_s - (time.perf_counter() - began)))
+                run.digests[number, n_session, view] = digest(answer)
+                time.sleep(max(0.0, every_s - (time.perf_counter() - start_s)))
 
 
 def digest(answer: dict[str, Any]) -> str:
-    """Of what does not depend on the moment or the asker."""
-    told = {name: answer[name] for name in ("domain", "map_version", "belief", "next_best_view", "retrieval")}
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    """A digest of the parts of an answer that depend on neither the moment nor the asker."""
+    content = {name: answer[name] for name in ("domain", "map_version", "belief", "next_best_view", "retrieval")}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def replicas() -> list[int]:
@@ -109,25 +109,25 @@ def replicas() -> list[int]:
 
 
 def measured(url: str, arguments: argparse.Namespace, kill_every_s: float | None) -> Run:
-    """Let the robots drive; replicas are killed where that is wanted."""
+    """Let the robots drive; a replica is killed every `kill_every_s` seconds; None: none is."""
     run, stopped, draws = Run(), threading.Event(), random.Random(1)
     with Link(url) as link:
         session = link.ask("POST", "/v1/domains/route-0/sessions", {})
         path = f"/v1/sessions/{session['session_id']}/observations?action_m=0"
         for _ in range(200):
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             link.ask("POST", path, {"ranked_landmarks": list(range(N_LANDMARKS))})
-            run.alone_s.append(time.perf_counter() - began)
+            run.alone_s.append(time.perf_counter() - start_s)
     robots = [
         threading.Thread(target=drive, args=(url, run, number, arguments.domains, arguments.every_s, stopped))
         for number in range(arguments.robots)
     ]
     for robot in robots:
         robot.start()
-    until = time.monotonic() + arguments.seconds
-    while (left_s := until - time.monotonic()) > 0:
+    end_s = time.monotonic() + arguments.seconds
+    while (left_s := end_s - time.monotonic()) > 0:
         time.sleep(min(left_s, kill_every_s or left_s))
-        if kill_every_s is not None and until - time.monotonic() > kill_every_s / 2 and (pids := replicas()):
+        if kill_every_s is not None and end_s - time.monotonic() > kill_every_s / 2 and (pids := replicas()):
             os.kill(draws.choice(pids), signal.SIGKILL)
             run.n_kills += 1
     stopped.set()
@@ -137,27 +137,27 @@ def measured(url: str, arguments: argparse.Namespace, kill_every_s: float | None
 
 
 def switched_s(url: str) -> list[float]:
-    """Seconds from asking for a rollback, and for what it rolled back, until no answer is of the other version."""
+    """Seconds from the request of every rollback, and of its reversal, until no answer is of the other version."""
     seconds = []
     with Link(url) as link:
         for n_switch in range(N_SWITCHES):
             version = 1 + n_switch % 2
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             link.ask("PUT", "/v1/admin/domains/route-0/active-map", {"version": version, "expected": 3 - version})
-            n_right, last = 0, began
+            n_right, last = 0, start_s
             while n_right < 20:  # of two owners in turn
                 answer = link.ask("POST", "/v1/domains/route-0/localizations", {"ranked_landmarks": [0, 1, 2]})
                 is_right = answer["map_version"] == version
                 n_right = n_right + 1 if is_right else 0
                 last = last if is_right and n_right > 1 else time.perf_counter()
-            seconds.append(last - began)
+            seconds.append(last - start_s)
     return seconds
 
 
 def make_domains(data_dir: Path, n_domains: int, n_images: int) -> None:
     """Routes of a few looks; `route-0` has two versions, of which the second serves."""
-    made, files = data_dir.with_name("made"), []
-    with LocalServer(made) as server, Link(server.url) as link:
+    looks_dir, files = data_dir.with_name("made"), []
+    with LocalServer(looks_dir) as server, Link(server.url) as link:
         for number in range(min(n_domains, N_LOOKS)):
             look, n_frames = f"look-{number}", n_images + 10 * number
             link.ask("PUT", f"/v1/admin/domains/{look}", {"evaluator": {"kind": "feature_l2", "extractor": "none"}})
@@ -166,7 +166,7 @@ def make_domains(data_dir: Path, n_domains: int, n_images: int) -> None:
             drives = {"training_traverse": "drive", "landmark_traverse": "drive"}
             link.remap(look, {**drives, "n_landmarks": N_LANDMARKS, "training_episodes": 0})
             files.append(data_dir.with_name(f"{look}.sqlite"))
-    with Catalog.open(made) as catalog:
+    with Catalog.open(looks_dir) as catalog:
         for file in files:
             export_map(catalog, file.stem, None, file)
     with Catalog.open(data_dir) as catalog:
@@ -190,14 +190,14 @@ def report(arguments: argparse.Namespace) -> Iterator[str]:
             *("--map-store", f"file://{folder}/store"),
         ]
         with server:
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             switches = switched_s(server.url)
-            calm_s = time.perf_counter() - began
+            calm_s = time.perf_counter() - start_s
             fleet = measured(server.url, arguments, arguments.kill_every_s)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    both = plain.told.keys() & fleet.told.keys()
-    n_wrong = sum(plain.told[view] != fleet.told[view] for view in both)
+    views = plain.digests.keys() & fleet.digests.keys()
+    n_wrong = sum(plain.digests[view] != fleet.digests[view] for view in views)
     yield "# A fleet whose replicas die"
     yield ""
     yield (
@@ -214,7 +214,7 @@ def report(arguments: argparse.Namespace) -> Iterator[str]:
     rows: list[tuple[str, Any, Any]] = [
         ("kills", "-", fleet.n_kills),
         ("observations acknowledged", len(plain.seconds), len(fleet.seconds)),
-        ("answers compared, of them unlike", "-", f"{len(both)}, {n_wrong}"),
+        ("answers compared, of them unlike", "-", f"{len(views)}, {n_wrong}"),
         ("acknowledged and lost, or answered otherwise than documented", len(plain.faults), len(fleet.faults)),
         ("503 with Retry-After", plain.refusals.total(), f"{fleet.refusals.total()} {dict(fleet.refusals)}"),
     ]
@@ -239,12 +239,12 @@ def report(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def quantile(seconds: list[float], share: float) -> float:
-    """Seconds within which this share came."""
+    """The quantile of seconds at a share, NaN of none."""
     return float(np.quantile(seconds, share)) if seconds else float("nan")
 
 
 def main() -> None:
-    """As the command line says."""
+    """Measure as the command line asks, and write the page."""
     parser = argparse.ArgumentParser(prog="python -m bench.fleet", description=__doc__)
     parser.add_argument("--domains", type=int, default=200)
     parser.add_argument("--images", type=int, default=200)

@@ -68,14 +68,14 @@ def memory(parent: int, title: str) -> list[int]:
 
 
 def ancestors(pid: int) -> Iterator[int]:
-    """The processes that began a process, and it."""
+    """A process and the processes above it, up to 1."""
     while pid > 1:
         yield pid
         pid = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 def at_once(url: str) -> Callable[[], None]:
-    """Several robots that send a picture after the other."""
+    """A run of several robots that send one picture after the other."""
 
     def drive(number: int) -> None:
         with Link(url) as link:
@@ -99,22 +99,25 @@ def report(n_repeats: int) -> Iterator[str]:
     try:
         make_domain(folder / "encoders-1")
         shutil.copytree(folder / "encoders-1", folder / "encoders-0")
-        plain, own, one = (
+        plain, without_encoder, with_encoder = (
             LocalServer(folder / "plain"),
             fleet_of(folder, 0, store + "-0"),
             fleet_of(folder, 1, store + "-1"),
         )
         shutil.copytree(folder / "encoders-1", folder / "plain")
-        with plain, own, one:
+        with plain, without_encoder, with_encoder:
             body = picture(7)
-            links = [Link(server.url) for server in (plain, own, one)]
+            links = [Link(server.url) for server in (plain, without_encoder, with_encoder)]
             answers = [link.ask("POST", URL, body, JPEG) for link in links]
             for answer in answers:
                 del answer["timings_ms"]
             is_same = all(answer == answers[0] for answer in answers)
             alone = interleaved([lambda link=link: link.ask("POST", URL, body, JPEG) for link in links], n_repeats, 20)
-            together = interleaved([at_once(server.url) for server in (plain, own, one)], 3)
-            sizes = [[memory(server.pid, title) for title in ("domains-", "admin", "encoder")] for server in (own, one)]
+            together = interleaved([at_once(server.url) for server in (plain, without_encoder, with_encoder)], 3)
+            sizes = [
+                [memory(server.pid, title) for title in ("domains-", "admin", "encoder")]
+                for server in (without_encoder, with_encoder)
+            ]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     yield "# One encoder for a fleet"
@@ -130,7 +133,7 @@ def report(n_repeats: int) -> Iterator[str]:
     yield f"Load average at the end: {', '.join(f'{load:.1f}' for load in os.getloadavg())}."
     yield ""
 
-    def told(sizes: list[int]) -> str:
+    def mean_size(sizes: list[int]) -> str:
         return f"{np.mean(sizes) / MEBIBYTE:.0f} MiB" if sizes else "-"
 
     def a_second(timing: Timing) -> str:
@@ -140,16 +143,16 @@ def report(n_repeats: int) -> Iterator[str]:
         ("one robot alone, median", *(duration(timing.median_s) for timing in alone)),
         ("one robot alone, p95", *(duration(float(np.quantile(timing.seconds, 0.95))) for timing in alone)),
         (f"{N_ROBOTS} robots at once, images a second", *map(a_second, together)),
-        ("memory of a replica", "-", *(told(each[0]) for each in sizes)),
-        ("memory of the one that administers", "-", *(told(each[1]) for each in sizes)),
-        ("memory of the encoder", "-", *(told(each[2]) for each in sizes)),
-        ("memory of all of these", "-", *(f"{sum(map(sum, each)) / MEBIBYTE:.0f} MiB" for each in sizes)),
+        ("memory of a replica", "-", *(mean_size(fleet_sizes[0]) for fleet_sizes in sizes)),
+        ("memory of the one that administers", "-", *(mean_size(fleet_sizes[1]) for fleet_sizes in sizes)),
+        ("memory of the encoder", "-", *(mean_size(fleet_sizes[2]) for fleet_sizes in sizes)),
+        ("memory of all of these", "-", *(f"{sum(map(sum, fleet_sizes)) / MEBIBYTE:.0f} MiB" for fleet_sizes in sizes)),
     ]
     yield from markdown(("", "plain service", "fleet, networks of their own", "fleet, one encoder"), rows)
 
 
 def main() -> None:
-    """As the command line says."""
+    """Measure as the command line asks, and write the page."""
     parser = argparse.ArgumentParser(prog="python -m bench.fleet_encoder", description=__doc__)
     parser.add_argument("--repeats", type=int, default=200, help="images of the robot that is alone")
     write_page("fleet-encoder.md", report(parser.parse_args().repeats))

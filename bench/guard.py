@@ -47,7 +47,7 @@ class Drive:
     """Frames of a recording, as one drive.
 
     Attributes:
-        frames: [n] their places in all frames of the world.
+        frames: [n] their rows in all frames of the world.
         position_m: [n] as the drive's own recorder would say.
         x_m, y_m: [n] where known.
     """
@@ -59,16 +59,16 @@ class Drive:
 
     def part(self, first: int, stop: int) -> "Drive":
         """Some of its frames, which keep their positions."""
-        chosen = slice(first, stop)
-        plane = [None if axis is None else axis[chosen] for axis in (self.x_m, self.y_m)]
-        return Drive(self.frames[chosen], self.position_m[chosen], *plane)
+        frames = slice(first, stop)
+        plane = [None if axis is None else axis[frames] for axis in (self.x_m, self.y_m)]
+        return Drive(self.frames[frames], self.position_m[frames], *plane)
 
     def restarted(self) -> "Drive":
         """The same frames as a recording that begins with them: positions from 0, and no plane."""
         return Drive(self.frames, self.position_m - self.position_m[0])
 
-    def moved(self, error_m: NDArray[np.float64]) -> "Drive":
-        """With errors in its positions, of the plane along x; never backwards along the route."""
+    def with_errors(self, error_m: NDArray[np.float64]) -> "Drive":
+        """The drive with errors [n] in its positions, in the plane along x; never backwards along the route."""
         x_m = None if self.x_m is None else self.x_m + error_m
         return Drive(self.frames, np.maximum.accumulate(self.position_m + error_m), x_m, self.y_m)
 
@@ -92,21 +92,27 @@ class World:
             self.drives[name] = Drive(np.arange(first, first + len(rows)), *measured)
             first += len(rows)
 
-    def verdicts(self, mapped: Drive, other: Drive) -> tuple[bool, bool]:
+    def verdicts(self, map_drive: Drive, other: Drive) -> tuple[bool, bool]:
         """Whether the old and the new rule take both for drives of one route; landmarks are of the other drive."""
         encodings = self.encodings[other.frames]
         landmarks = other.frames[select_landmarks(encodings, min(N_LANDMARKS, other.n_frames))]
-        own, second = (self._dissimilarities[np.ix_(drive.frames, landmarks)] for drive in (mapped, other))
-        here, there = (Route(drive.position_m, x_m=drive.x_m, y_m=drive.y_m) for drive in (mapped, other))
-        places = same_places(there, here)
-        return _old_rule(own, second, places), judge(own, second, places, mapped.position_m).accepted
+        map_dissimilarities, other_dissimilarities = (
+            self._dissimilarities[np.ix_(drive.frames, landmarks)] for drive in (map_drive, other)
+        )
+        map_route, other_route = (Route(drive.position_m, x_m=drive.x_m, y_m=drive.y_m) for drive in (map_drive, other))
+        places = same_places(other_route, map_route)
+        return _old_rule(map_dissimilarities, other_dissimilarities, places), judge(
+            map_dissimilarities, other_dissimilarities, places, map_drive.position_m
+        ).accepted
 
 
-def _old_rule(own: NDArray[np.float32], second: NDArray[np.float32], places: NDArray[np.int64]) -> bool:
+def _old_rule(
+    map_dissimilarities: NDArray[np.float32], other_dissimilarities: NDArray[np.float32], places: NDArray[np.int64]
+) -> bool:
     if len(places) < LEAST_PLACES:
         return False
     z = []
-    for dissimilarities in (own, second):
+    for dissimilarities in (map_dissimilarities, other_dissimilarities):
         ranks = rank_landmarks(dissimilarities)
         z.append(LandmarkStatistics.of_map(ranks).standardise(ranks))
     return float((z[0][places[:, 0]] * z[1][places[:, 1]]).mean()) >= OLD_LEAST_CORRELATION
@@ -120,56 +126,56 @@ def railway_pairs(world: World, names: Sequence[str], part: str) -> Iterator[tup
     n = world.drives[names[0]].n_frames
     low, high = (round(share * n) for share in ROWS[part])
 
-    def length(rng: np.random.Generator, most: int) -> int:
-        return int(rng.integers(SHORTEST, min(LONGEST, most) + 1))
+    def length(rng: np.random.Generator, n_most: int) -> int:
+        return int(rng.integers(SHORTEST, min(LONGEST, n_most) + 1))
 
-    def apart(rng: np.random.Generator, first: str, second: str) -> tuple[Drive, Drive]:
+    def two_places(rng: np.random.Generator, first: str, second: str) -> tuple[Drive, Drive]:
         n_frames = length(rng, (high - low) // 2)
         gap = int(rng.integers(n_frames, high - low - n_frames + 1))
         start = int(rng.integers(low, high - n_frames - gap + 1))
         starts = (start, start + gap) if rng.integers(2) else (start + gap, start)
         stops = (starts[0] + n_frames, starts[1] + n_frames)
-        mapped, other = world.drives[first].part(starts[0], stops[0]), world.drives[second].part(starts[1], stops[1])
-        return mapped.restarted(), other.restarted()
+        map_drive, other = world.drives[first].part(starts[0], stops[0]), world.drives[second].part(starts[1], stops[1])
+        return map_drive.restarted(), other.restarted()
 
     def of_two(rng: np.random.Generator) -> tuple[str, str]:
         first, second = rng.choice(len(names), 2, replace=False)
         return names[first], names[second]
 
-    def same(rng: np.random.Generator) -> tuple[Drive, Drive]:
+    def one_stretch(rng: np.random.Generator) -> tuple[Drive, Drive]:
         n_frames = length(rng, high - low)
         start = int(rng.integers(low, high - n_frames + 1))
         first, second = (world.drives[name].part(start, start + n_frames) for name in of_two(rng))
         return first, second
 
     def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        first, second = same(rng)
-        return first, second.moved(rng.integers(-1, 2, second.n_frames).astype(np.float64))
+        first, second = one_stretch(rng)
+        return first, second.with_errors(rng.integers(-1, 2, second.n_frames).astype(np.float64))
 
     def reversed_drive(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        first, second = same(rng)
+        first, second = one_stretch(rng)
         return first.restarted(), Drive(second.frames[::-1], second.position_m[-1] - second.position_m[::-1])
 
-    yield "two places of the railway, one season", False, lambda rng: apart(rng, *(of_two(rng)[0],) * 2)
-    yield "two places of the railway, two seasons", False, lambda rng: apart(rng, *of_two(rng))
+    yield "two places of the railway, one season", False, lambda rng: two_places(rng, *(of_two(rng)[0],) * 2)
+    yield "two places of the railway, two seasons", False, lambda rng: two_places(rng, *of_two(rng))
     yield "one stretch of the railway, driven backwards", False, reversed_drive
-    yield "one stretch of the railway", True, same
+    yield "one stretch of the railway", True, one_stretch
     yield "one stretch of the railway, positions wrong by up to a frame", True, inexact
-    yield "one stretch of the railway, overlap in part", True, lambda rng: overlapping(rng, *same(rng))
+    yield "one stretch of the railway, overlap in part", True, lambda rng: overlapping(rng, *one_stretch(rng))
 
 
-def overlapping(rng: np.random.Generator, mapped: Drive, other: Drive) -> tuple[Drive, Drive]:
+def overlapping(rng: np.random.Generator, map_drive: Drive, other: Drive) -> tuple[Drive, Drive]:
     """The other drive reduced to half or more of its frames, 45 at least."""
     n_frames = int(rng.integers(min(max(45, other.n_frames // 2), other.n_frames), other.n_frames + 1))
     first = int(rng.integers(0, other.n_frames - n_frames + 1))
-    return mapped, other.part(first, first + n_frames)
+    return map_drive, other.part(first, first + n_frames)
 
 
 def corridor_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
-    """The corridor beside the railway."""
+    """As `railway_pairs`, of the corridor and the railway."""
     low, high = (round(share * world.drives["nordland_summer"].n_frames) for share in ROWS[part])
 
-    def elsewhere(rng: np.random.Generator) -> tuple[Drive, Drive]:
+    def corridor_and_railway(rng: np.random.Generator) -> tuple[Drive, Drive]:
         corridor = world.drives[("corridor_ref", "corridor_query")[rng.integers(2)]]
         n_frames = int(rng.integers(SHORTEST, corridor.n_frames + 1))
         first = int(rng.integers(0, corridor.n_frames - n_frames + 1))
@@ -178,16 +184,16 @@ def corridor_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
         drives = corridor.part(first, first + n_frames).restarted(), railway.restarted()
         return drives if rng.integers(2) else drives[::-1]
 
-    yield "corridor and railway", False, elsewhere
+    yield "corridor and railway", False, corridor_and_railway
 
 
 def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
-    """Rendered campuses; one seed and season is one drive."""
+    """As `railway_pairs`, of rendered campuses; one seed and season is one drive."""
     seeds, sliced = CAMPUSES[part], SLICED_CAMPUSES[part]
 
     def drive(rng: np.random.Generator, seed: int, season: int | None = None) -> Drive:
-        chosen = int(rng.integers(2)) if season is None else season
-        return world.drives[f"campus{seed}_{SEASONS[chosen]}"]
+        season_number = int(rng.integers(2)) if season is None else season
+        return world.drives[f"campus{seed}_{SEASONS[season_number]}"]
 
     def two_campuses(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = (drive(rng, int(seed)) for seed in rng.choice(seeds, 2, replace=False))
@@ -204,7 +210,7 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
         ordered = drives if rng.integers(2) else drives[::-1]
         return ordered[0].restarted(), ordered[1].restarted()
 
-    def same(rng: np.random.Generator) -> tuple[Drive, Drive]:
+    def one_stretch(rng: np.random.Generator) -> tuple[Drive, Drive]:
         seed, season = int(rng.choice(seeds)), int(rng.integers(2))
         first, second = drive(rng, seed, season), drive(rng, seed, 1 - season)
         n_frames = int(rng.integers(SHORTEST, first.n_frames + 1))
@@ -212,22 +218,22 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
         return first.part(start, start + n_frames), second
 
     def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        first, second = same(rng)
-        return first, second.moved(rng.normal(0, 1.5, second.n_frames))
+        first, second = one_stretch(rng)
+        return first, second.with_errors(rng.normal(0, 1.5, second.n_frames))
 
     def adrift(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        first, second = same(rng)
+        first, second = one_stretch(rng)
         walk = np.cumsum(rng.normal(0, 0.3, second.n_frames))
-        return first, second.moved(np.clip(walk - walk.mean(), -3, 3))
+        return first, second.with_errors(np.clip(walk - walk.mean(), -3, 3))
 
     def in_part(rng: np.random.Generator) -> tuple[Drive, Drive]:
-        mapped, other = same(rng)
-        first, stop = np.searchsorted(other.position_m, mapped.position_m[[0, -1]])
-        return overlapping(rng, mapped, other.part(int(first), int(stop)))
+        map_drive, other = one_stretch(rng)
+        first, stop = np.searchsorted(other.position_m, map_drive.position_m[[0, -1]])
+        return overlapping(rng, map_drive, other.part(int(first), int(stop)))
 
     yield "two rendered campuses", False, two_campuses
     yield "two places of one rendered campus", False, two_slices
-    yield "one stretch of a rendered campus", True, same
+    yield "one stretch of a rendered campus", True, one_stretch
     yield "one stretch of a rendered campus, positions wrong by 1.5 m", True, inexact
     yield "one stretch of a rendered campus, positions adrift by up to 3 m", True, adrift
     yield "one stretch of a rendered campus, overlap in part", True, in_part
@@ -237,9 +243,9 @@ def worlds(folder: Path, data: Path) -> Iterator[tuple[str, World]]:
     """The railway in three seasons as ready NetVLAD encodings, then all images under every extractor."""
     yield "netvlad", World({name: np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in NETVLAD}, {})
     for extractor in EXTRACTORS:
-        kept = {path.name.split(".")[0]: np.load(path) for path in sorted(folder.glob(f"*.{extractor}.npz"))}
-        plane = {name: np.stack([rows[axis] for axis in "pxy"]) for name, rows in kept.items() if "p" in rows.files}
-        yield extractor, World({name: rows["e"] for name, rows in kept.items()}, plane)
+        arrays = {path.name.split(".")[0]: np.load(path) for path in sorted(folder.glob(f"*.{extractor}.npz"))}
+        plane = {name: np.stack([rows[axis] for axis in "pxy"]) for name, rows in arrays.items() if "p" in rows.files}
+        yield extractor, World({name: rows["e"] for name, rows in arrays.items()}, plane)
 
 
 def encode(folder: Path, data: Path) -> None:
@@ -299,7 +305,7 @@ def measure(world: World, encoder: str, part: str) -> Iterator[Row]:
         yield Row(kind, encoder, is_one_route, part, *verdicts.sum(axis=0).tolist())
 
 
-def shown(n_accepted: int, n: int) -> str:
+def share_text(n_accepted: int, n: int) -> str:
     """A share and Wilson's 95 % interval of it, in percent."""
     z, share = 1.96, n_accepted / n
     centre = (share + z * z / (2 * n)) / (1 + z * z / n)
@@ -309,9 +315,9 @@ def shown(n_accepted: int, n: int) -> str:
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
     """Markdown lines, with all kinds together last."""
-    cells = [(row.kind, row.encoder, PAIRS, shown(row.n_old, PAIRS), shown(row.n_new, PAIRS)) for row in rows]
+    cells = [(row.kind, row.encoder, PAIRS, share_text(row.n_old, PAIRS), share_text(row.n_new, PAIRS)) for row in rows]
     n, n_old, n_new = PAIRS * len(rows), sum(row.n_old for row in rows), sum(row.n_new for row in rows)
-    everything = ("**all**", "", n, shown(n_old, n), f"**{shown(n_new, n)}**")
+    everything = ("**all**", "", n, share_text(n_old, n), f"**{share_text(n_new, n)}**")
     return markdown(("pairs", "encoder", "n", "old rule accepts, %", "accepts, %"), [*cells, everything])
 
 
@@ -342,8 +348,8 @@ def report(rows: Sequence[Row]) -> list[str]:
     }
     for part, head in heads.items():
         for is_one_route, title in ((False, "Drives of two places"), (True, "Drives of one route, in two seasons")):
-            chosen = [row for row in rows if row.part == part and row.is_one_route is is_one_route]
-            lines += ["", *([head, ""] if not is_one_route else []), f"{title}:", "", *table(chosen)]
+            part_rows = [row for row in rows if row.part == part and row.is_one_route is is_one_route]
+            lines += ["", *([head, ""] if not is_one_route else []), f"{title}:", "", *table(part_rows)]
     return lines
 
 

@@ -37,12 +37,12 @@ VIEW = json.dumps({"ranked_landmarks": list(range(N_LANDMARKS))}).encode()
 
 def request(method: str, path: str, body: bytes = b"", **headers: str) -> bytes:
     """The bytes of a request."""
-    given = {
+    fields = {
         "Host": "localhost",
         "Content-Length": str(len(body)),
         **{k.replace("_", "-"): v for k, v in headers.items()},
     }
-    lines = [f"{method} {path} HTTP/1.1", *(f"{name}: {value}" for name, value in given.items() if value)]
+    lines = [f"{method} {path} HTTP/1.1", *(f"{name}: {value}" for name, value in fields.items() if value)]
     return "\r\n".join([*lines, "", ""]).encode("latin-1") + body
 
 
@@ -68,7 +68,7 @@ def deflate_bomb() -> bytes:
 
 
 def attacks() -> dict[str, bytes]:
-    """What is sent in one go, by what it is."""
+    """Requests that are sent in one go, by what they are."""
 
     def view(body: bytes, **headers: str) -> bytes:
         return request("POST", _LOCALIZE, body, **{"Content_Type": JSON, **headers})
@@ -93,21 +93,21 @@ def attacks() -> dict[str, bytes]:
     }
 
 
-def told(port: int, sent: bytes, give_up_s: float = 60.0) -> tuple[float, str]:
+def answer_to(port: int, content: bytes, give_up_s: float = 60.0) -> tuple[float, str]:
     """Seconds from the last byte to the answer, and its status line and code."""
     with socket.create_connection(("127.0.0.1", port), timeout=give_up_s) as connection:
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         with contextlib.suppress(ConnectionError):
-            connection.sendall(sent)
+            connection.sendall(content)
         answer = b""
         try:
-            while not _is_whole(answer) and (more := connection.recv(65536)):
-                answer += more
+            while not _is_whole(answer) and (received := connection.recv(65536)):
+                answer += received
         except TimeoutError:
-            return time.perf_counter() - began, "none: it is held until the sender leaves, or a proxy ends it"
+            return time.perf_counter() - start_s, "none: it is held until the sender leaves, or a proxy ends it"
         except ConnectionError:
             pass
-        return time.perf_counter() - began, _verdict(answer)
+        return time.perf_counter() - start_s, _verdict(answer)
 
 
 def _is_whole(answer: bytes) -> bool:
@@ -124,23 +124,23 @@ def _verdict(answer: bytes) -> str:
 
 
 def slow_senders(port: int) -> dict[str, tuple[float, str]]:
-    """Those who stop in the middle for half a minute, and one who is slow but goes on; all at once."""
-    whole, half_a_head = request("POST", _LOCALIZE, VIEW, Content_Type=JSON), request("GET", "/healthz")[:-2]
+    """Answers to senders that stop half-way for half a minute, and to one that is slow and goes on; all at once."""
+    whole_request, half_a_head = request("POST", _LOCALIZE, VIEW, Content_Type=JSON), request("GET", "/healthz")[:-2]
 
     def goes_on() -> tuple[float, str]:
         with socket.create_connection(("127.0.0.1", port), timeout=60) as connection:
-            began = time.perf_counter()
-            connection.sendall(whole[: -len(VIEW)])
+            start_s = time.perf_counter()
+            connection.sendall(whole_request[: -len(VIEW)])
             for piece in np.array_split(np.frombuffer(VIEW, np.uint8), 40):
                 time.sleep(1.0)
                 connection.sendall(piece.tobytes())
-            return time.perf_counter() - began, _verdict(connection.recv(65536))
+            return time.perf_counter() - start_s, _verdict(connection.recv(65536))
 
     with ThreadPoolExecutor(3) as senders:
         sending = {
             "a body of which a piece comes every second, 40 s long": senders.submit(goes_on),
-            "headers that never end, silent": senders.submit(told, port, half_a_head, 30),
-            "a body that stops in the middle": senders.submit(told, port, whole[:-10], 30),
+            "headers that never end, silent": senders.submit(answer_to, port, half_a_head, 30),
+            "a body that stops in the middle": senders.submit(answer_to, port, whole_request[:-10], 30),
         }
         return {name: future.result() for name, future in sending.items()}
 
@@ -155,32 +155,34 @@ def robot_ms(url: str) -> tuple[str, str]:
 
 
 def large_crowd(url: str, pid: int) -> tuple[tuple[str, str], Counter[str], float]:
-    """A robot while many send images just under the limit, what those were told, and the peak of memory in MB."""
+    """A robot's times while many send images just under the limit, the answers to those, and the peak memory in MB."""
     port, picture = int(url.rpartition(":")[2]), np.full((*_LARGE, 3), 90, np.uint8)
     bodies = [  # few bytes, of as many pixels as are taken
-        request("POST", _LOCALIZE, cv2.imencode(f".{kind}", picture, how)[1].tobytes(), Content_Type=f"image/{kind}")
-        for kind, how in (("webp", [cv2.IMWRITE_WEBP_QUALITY, 101]), ("png", []))
+        request(
+            "POST", _LOCALIZE, cv2.imencode(f".{kind}", picture, options)[1].tobytes(), Content_Type=f"image/{kind}"
+        )
+        for kind, options in (("webp", [cv2.IMWRITE_WEBP_QUALITY, 101]), ("png", []))
     ]
-    verdicts, ended = Counter[str](), threading.Event()
+    verdicts, is_over = Counter[str](), threading.Event()
 
     def send(number: int) -> None:
-        while not ended.is_set():
-            verdict = told(port, bodies[number % 2])[1]
+        while not is_over.is_set():
+            verdict = answer_to(port, bodies[number % 2])[1]
             verdicts[verdict] += 1
             if verdict.startswith("503"):
-                ended.wait(1.0)  # as `Retry-After` says
+                is_over.wait(1.0)  # as `Retry-After` says
 
     Path(f"/proc/{pid}/clear_refs").write_text("5")  # the peak from now on
     with ThreadPoolExecutor(_LARGE_SENDERS) as senders:
         sending = [senders.submit(send, number) for number in range(_LARGE_SENDERS)]
         try:
-            measured = robot_ms(url)
+            robot_times = robot_ms(url)
         finally:
-            ended.set()
+            is_over.set()
         for future in sending:
             future.result()
     status = Path(f"/proc/{pid}/status").read_text()
-    return measured, verdicts, int(status.partition("VmHWM:")[2].split()[0]) / 1024
+    return robot_times, verdicts, int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
 def hostile_table() -> Iterator[str]:
@@ -190,10 +192,10 @@ def hostile_table() -> Iterator[str]:
         with Link(server.url) as link:
             make_domain(link)
         robot_ms(server.url)  # warms up
-        before, robot = Sample.of(server.pid), {"alone": robot_ms(server.url)}
+        earlier, robot = Sample.of(server.pid), {"alone": robot_ms(server.url)}
         rows = []
-        for name, sent in attacks().items():
-            seconds, verdict = told(port, sent)
+        for name, content in attacks().items():
+            seconds, verdict = answer_to(port, content)
             rows.append((name, verdict, f"{1000 * seconds:.0f} ms"))
         with contextlib.ExitStack() as stack:
             for _ in range(_SILENT):
@@ -203,7 +205,7 @@ def hostile_table() -> Iterator[str]:
         rows += [(name, verdict, f"{seconds:.1f} s") for name, (seconds, verdict) in slow_senders(port).items()]
         crowd, verdicts, peak_mb = large_crowd(server.url, server.pid)
         robot[f"beside {_LARGE_SENDERS} senders of images just under the limit"] = crowd
-        after = Sample.of(server.pid)
+        later = Sample.of(server.pid)
     yield from markdown(("sent", "answer", "after"), rows)
     yield ""
     yield from markdown(("a robot's localization", "median", "p99"), [(name, *spent) for name, spent in robot.items()])
@@ -212,8 +214,8 @@ def hostile_table() -> Iterator[str]:
     yield f"Images just under the limit were answered {answers}; the service's memory was {peak_mb:.0f} MB at its peak."
     yield ""
     yield (
-        f"The service's memory before and after all of it: {before.rss_mb:.0f} and {after.rss_mb:.0f} MB; "
-        f"its file handles: {before.n_handles} and {after.n_handles}."
+        f"The service's memory before and after all of it: {earlier.rss_mb:.0f} and {later.rss_mb:.0f} MB; "
+        f"its file handles: {earlier.n_handles} and {later.n_handles}."
     )
 
 

@@ -39,7 +39,7 @@ def index_table() -> Iterator[str]:
     limits = []
     rows = []
     for name, maps in _maps():
-        figures = np.array([_bits(each) for each in maps])
+        figures = np.array([_bits(map_) for map_ in maps])
         means = figures.mean(axis=0)
         rows.append([name, f"{maps[0].n_images:,}", maps[0].n_landmarks, *(f"{mean:.1f}" for mean in means)])
         limits.append(Limit(f"{name}, r = {maps[0].n_landmarks}", means[-1], round(_MARGIN * min(means[1:3]), 1)))
@@ -56,13 +56,13 @@ def index_table() -> Iterator[str]:
     yield from limit_table(limits)
     yield ""
     lists, prototypes = scattered_lists(NCLT_IMAGES), _random_prototypes()
-    began = perf_counter()
+    start_s = perf_counter()
     blocks = pack_lists(lists, N_LANDMARKS, prototypes)
-    written = perf_counter()
+    written_s = perf_counter()
     unpack_lists(blocks, *lists.shape, N_LANDMARKS, prototypes)
     yield (
-        f"The lists drawn at random, which take longest, are written in {written - began:.2f} s and read in "
-        f"{perf_counter() - written:.2f} s."
+        f"The lists drawn at random, which take longest, are written in {written_s - start_s:.2f} s and read in "
+        f"{perf_counter() - written_s:.2f} s."
     )
 
 
@@ -103,19 +103,19 @@ def _map(drive: Drive, second: Drive | None, landmarks: Drive, n_landmarks: int,
 
 
 def _bits(map_: Map) -> list[float]:
-    """The columns of the table, a map image."""
+    """The cells of a map in the table, in bits a map image."""
     lists, r, n = map_.lists, map_.n_landmarks, map_.n_images
     width = (r - 1).bit_length()
     bits = (lists.T.reshape(-1, 1) >> np.arange(width - 1, -1, -1)) & 1
     packed = (np.packbits(bits.astype(np.uint8)).tobytes(), lists.T.astype("<u2").tobytes())
-    xz = min(len(lzma.compress(each, preset=9 | lzma.PRESET_EXTREME)) for each in packed)
+    xz = min(len(lzma.compress(content, preset=9 | lzma.PRESET_EXTREME)) for content in packed)
     code = sum(map(len, pack_lists(lists, r, map_.landmark_model["prototypes"])))
     with tempfile.TemporaryDirectory() as folder:
         write_map(Path(folder) / "building", map_)
         seal(Path(folder) / "building", Path(folder) / "sealed")
         pages = index_bytes(Path(folder) / "sealed")
-    whole = lists.astype(np.int64)
-    models = (_by_place(whole, r) / n, _by_list(whole, r) / n)
+    wide_lists = lists.astype(np.int64)
+    models = (_by_place(wide_lists, r) / n, _by_list(wide_lists, r) / n)
     return [len(lists) * np.log2(r), *models, 8 * xz / n, 8 * code / n, 8 * pages / n]
 
 
@@ -124,23 +124,23 @@ def _by_place(lists: NDArray[np.int64], n_landmarks: int) -> float:
     """Bits of all lists by the adaptive order-1 model of every place, the landmarks of that place beside it."""
     bits = 0.0
     for row in lists:
-        followed, listed = np.zeros((n_landmarks, n_landmarks)), np.full(n_landmarks, 0.5)
+        successors, counts = np.zeros((n_landmarks, n_landmarks)), np.full(n_landmarks, 0.5)
         for m in range(row.size):
-            share = listed[row[m]] / listed.sum()
+            share = counts[row[m]] / counts.sum()
             if m > 0:
-                share = (followed[row[m - 1], row[m]] + 4 * share) / (followed[row[m - 1]].sum() + 4)
-                followed[row[m - 1], row[m]] += 1
+                share = (successors[row[m - 1], row[m]] + 4 * share) / (successors[row[m - 1]].sum() + 4)
+                successors[row[m - 1], row[m]] += 1
             bits -= np.log2(share)
-            listed[row[m]] += 1
+            counts[row[m]] += 1
     return bits
 
 
 @njit(cache=True)
 def _by_list(lists: NDArray[np.int64], n_landmarks: int) -> float:
-    """Bits of all lists by which place of the list before each repeats, adaptively, else by all landmarks listed."""
+    """Bits of all lists by an adaptive model of which place of the list before repeats, else of landmarks listed."""
     h, n = lists.shape
     bits = 0.0
-    repeats, listed = np.full((h, h + 1), 0.5), np.full(n_landmarks, 0.5)
+    repeats, counts = np.full((h, h + 1), 0.5), np.full(n_landmarks, 0.5)
     for m in range(n):
         is_free = np.ones(n_landmarks)
         for j in range(h):
@@ -157,8 +157,8 @@ def _by_list(lists: NDArray[np.int64], n_landmarks: int) -> float:
                 bits -= np.log2(repeats[j, place] / total)
                 repeats[j, place] += 1
             if place == h:
-                bits -= np.log2(listed[landmark] / (listed * is_free).sum())
+                bits -= np.log2(counts[landmark] / (counts * is_free).sum())
             is_free[landmark] = 0
         for j in range(h):
-            listed[lists[j, m]] += 1
+            counts[lists[j, m]] += 1
     return bits

@@ -38,13 +38,13 @@ Lists = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_] | 
 
 def medoids(u: NDArray[np.float32], n_landmarks: int) -> NDArray[np.int64]:
     """[r] the rows nearest to the centres of k-means of unit vectors, none twice."""
-    centres, taken = unit(k_means(u, n_landmarks)), np.zeros(len(u), bool)
-    chosen = []
+    centres, is_taken = unit(k_means(u, n_landmarks)), np.zeros(len(u), bool)
+    rows = []
     for products in centres @ u.T:
-        products[taken] = -2.0
-        chosen.append(int(products.argmax()))
-        taken[chosen[-1]] = True
-    return np.array(chosen, np.int64)
+        products[is_taken] = -2.0
+        rows.append(int(products.argmax()))
+        is_taken[rows[-1]] = True
+    return np.array(rows, np.int64)
 
 
 RULES: dict[str, Rule] = {
@@ -63,21 +63,21 @@ class Case:
     test: Drive
     second: Drive | None = None  # of the same route, and the landmark drive; None: the training drive gives them
 
-    def built(self, r: int) -> Built:
-        """By the default."""
+    def build(self, r: int) -> Built:
+        """The map with `r` landmarks chosen by the default rule."""
         plan = MapPlan(Relevance.COMPOSED, LIST_LENGTH, (1.0,), same_route=self.second is not None)
         return compose_map(plan, self.training, self.second, self.second, r)
 
-    def landmarks(self, built: Built, rule: Rule, r: int) -> NDArray[np.float32]:
-        """[r, k] chosen by a rule, where the map is described."""
+    def landmarks(self, built_map: Built, rule: Rule, r: int) -> NDArray[np.float32]:
+        """[r, k] landmarks chosen by a rule, as unit vectors of the map."""
         candidates = self.second or self.training
-        projection = built.map.landmark_model.get("projection")
+        projection = built_map.map.landmark_model.get("projection")
         u = described(candidates.encodings, Moments.of(candidates.encodings), projection)
         return u[rule(u, r)]
 
 
 def cases() -> dict[str, list[Case]]:
-    """By name: real recordings, and how they are used."""
+    """Cases of real recordings, by the name of their set."""
     drives = netvlad_drives()
     folder, evaluator = real_recordings(), make_evaluator(evaluator_config({"kind": "feature_l2"}))
 
@@ -94,25 +94,25 @@ def cases() -> dict[str, list[Case]]:
     }
 
 
-def accuracy(named: dict[str, list[Case]]) -> Iterator[str]:
+def accuracy(all_cases: dict[str, list[Case]]) -> Iterator[str]:
     """ANR and R@1 by set, rule and r; r is cut to the number of frames."""
     rows = []
-    for name, of in named.items():
+    for name, set_cases in all_cases.items():
         scores: dict[str, list[list[RetrievalScores]]] = {rule: [] for rule in (*RULES, AS_CHOSEN)}
         for r in _NUMBERS:
             for per_rule in scores.values():
                 per_rule.append([])
-            for case in of:
+            for case in set_cases:
                 n_landmarks = min(r, case.training.n_frames)
-                built = case.built(n_landmarks)
+                built_map = case.build(n_landmarks)
                 for rule, per_rule in scores.items():
-                    landmarks = case.landmarks(built, RULES.get(rule, farthest_first), n_landmarks)
+                    landmarks = case.landmarks(built_map, RULES.get(rule, farthest_first), n_landmarks)
                     if rule != AS_CHOSEN:
-                        landmarks = learnt_landmarks(built.places, landmarks, LIST_LENGTH)
-                    restored = composed_places(compose(built.places, landmarks, LIST_LENGTH), landmarks)
-                    per_rule[-1].append(scored(built, restored, case.test))
+                        landmarks = learnt_landmarks(built_map.places, landmarks, LIST_LENGTH)
+                    restored = composed_places(compose(built_map.places, landmarks, LIST_LENGTH), landmarks)
+                    per_rule[-1].append(scored(built_map, restored, case.test))
         for rule, by_r in scores.items():
-            cells = (row_of(each) for each in by_r)
+            cells = (row_of(scores_of_r) for scores_of_r in by_r)
             rows.append([name, rule, *(f"{anr} / {recall}" for anr, recall, _ in cells)])
     return markdown(("set", "landmarks by", *(f"r = {r}" for r in _NUMBERS)), rows)
 
@@ -123,35 +123,35 @@ def times() -> Iterator[str]:
     for n in _LENGTHS:
         steps = np.random.default_rng(0).normal(size=(n, composed.MOST_DIMENSIONS)).astype(np.float32)
         u = unit(steps + np.roll(steps, 1, axis=0) + np.roll(steps, 2, axis=0))
-        chosen = [timed(lambda rule=rule, u=u: rule(u, _N_LANDMARKS), 1, 0) for rule in RULES.values()]
+        choosing = [timed(lambda rule=rule, u=u: rule(u, _N_LANDMARKS), 1, 0) for rule in RULES.values()]
         landmarks = u[farthest_first(u, _N_LANDMARKS)]
         moving = timed(lambda u=u, landmarks=landmarks: learnt_landmarks(u, landmarks, LIST_LENGTH), 1, 0)
         composing = timed(lambda u=u, landmarks=landmarks: compose(u, landmarks, LIST_LENGTH), 1, 0)
-        rows.append([f"{n:,}", *(duration(each.median_s) for each in (*chosen, moving, composing))])
+        rows.append([f"{n:,}", *(duration(timing.median_s) for timing in (*choosing, moving, composing))])
     return markdown(("map images", *RULES, "moved", "all lists"), rows)
 
 
 def by_beam(
     places: NDArray[np.float32], landmarks: NDArray[np.float32], barred: NDArray[np.bool_] | None
 ) -> NDArray[np.uint16]:
-    """[h, n] as they ship."""
+    """[h, n] lists by the default."""
     return compose(places, landmarks, LIST_LENGTH, barred)
 
 
 def greedy(
     places: NDArray[np.float32], landmarks: NDArray[np.float32], barred: NDArray[np.bool_] | None
 ) -> NDArray[np.uint16]:
-    """[h, n] the landmark that brings the sum nearest, one after the other: a beam of one."""
+    """[h, n] lists by a beam of one: one after the other, the landmark that brings the sum nearest."""
     products, gram, rows = places @ landmarks.T, landmarks @ landmarks.T, np.arange(len(places))
     excluded = np.zeros(products.shape, bool) if barred is None else barred.copy()
-    along, squares, cross, lists = np.zeros(len(places)), np.zeros(len(places)), np.zeros(products.shape), []
+    products_so_far, squares, cross, lists = np.zeros(len(places)), np.zeros(len(places)), np.zeros(products.shape), []
     for weight in composed.list_weights(LIST_LENGTH):
-        cosine = (along[:, np.newaxis] + weight * products) / np.sqrt(
+        cosine = (products_so_far[:, np.newaxis] + weight * products) / np.sqrt(
             np.maximum(squares[:, np.newaxis] + weight * (2 * cross + weight), 1e-9)
         )
         cosine[excluded] = -np.inf
         lists.append(ids := cosine.argmax(axis=1))
-        along += weight * products[rows, ids]
+        products_so_far += weight * products[rows, ids]
         squares += weight * (2 * cross[rows, ids] + weight)
         cross += weight * gram[ids]
         excluded[rows, ids] = True
@@ -161,15 +161,15 @@ def greedy(
 def smoothed(
     places: NDArray[np.float32], landmarks: NDArray[np.float32], barred: NDArray[np.bool_] | None
 ) -> NDArray[np.uint16]:
-    """[h, n] of places that are the mean of themselves and, at a quarter, their neighbours along the route."""
-    beside = np.concatenate([places[:1], places, places[-1:]])
-    return by_beam(unit(places + 0.25 * (beside[:-2] + beside[2:])), landmarks, barred)
+    """[h, n] lists of places to which a quarter of their neighbours along the route is added."""
+    padded = np.concatenate([places[:1], places, places[-1:]])
+    return by_beam(unit(places + 0.25 * (padded[:-2] + padded[2:])), landmarks, barred)
 
 
 WEIGHTS = [tuple(share**place for place in range(LIST_LENGTH)) for share in (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)]
 
 
-def tried(of: Sequence[Case], r: int) -> Iterator[str]:
+def tried(set_cases: Sequence[Case], r: int) -> Iterator[str]:
     """Other ways to make lists, by rehearsal and on the test drives."""
     ways: dict[str, tuple[tuple[float, ...], Lists]] = {
         "beam of 8 (default)": (composed.WEIGHTS, by_beam),
@@ -179,38 +179,38 @@ def tried(of: Sequence[Case], r: int) -> Iterator[str]:
     }
     rehearsals: dict[str, list[RetrievalScores]] = {name: [] for name in ways}
     tests: dict[str, list[RetrievalScores]] = {name: [] for name in ways}
-    for case in of:
-        built = case.built(r)
-        landmarks = case.landmarks(built, farthest_first, r)
+    for case in set_cases:
+        built_map = case.build(r)
+        landmarks = case.landmarks(built_map, farthest_first, r)
         for name, (weights, lists) in ways.items():
             frozen = np.array(weights, np.float32)
             with patch.object(composed, "list_weights", lambda _, frozen=frozen: frozen):
-                rehearsals[name].append(rehearsed(case, built, landmarks, frozen, lists))
-                restored = weighted(lists(built.places, landmarks, None), landmarks, frozen)
-            tests[name].append(scored(built, restored, case.test))
+                rehearsals[name].append(rehearsed(case, built_map, landmarks, frozen, lists))
+                restored = weighted(lists(built_map.places, landmarks, None), landmarks, frozen)
+            tests[name].append(scored(built_map, restored, case.test))
     rows = [[name, *row_of(rehearsals[name]), *row_of(tests[name])] for name in ways]
-    titles = (f"{where}: {what}" for where in ("rehearsal", "test") for what in ("ANR %", "R@1 %", "worst"))
+    titles = (f"{judge}: {figure}" for judge in ("rehearsal", "test") for figure in ("ANR %", "R@1 %", "worst"))
     return markdown(("lists by", *titles), rows)
 
 
 def weighted(
     lists: NDArray[np.uint16], landmarks: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """[n, k] directions of the sums of lists with these weights."""
+    """[n, k] directions of the weighted sums of lists [h, n]."""
     return unit(np.einsum("h,hnk->nk", weights, landmarks[lists]))
 
 
 def rehearsed(
-    case: Case, built: Built, landmarks: NDArray[np.float32], weights: NDArray[np.float32], lists: Lists
+    case: Case, built_map: Built, landmarks: NDArray[np.float32], weights: NDArray[np.float32], lists: Lists
 ) -> RetrievalScores:
-    """The landmark drive against lists of the training drive alone, its own places' landmarks barred."""
-    projection = built.map.landmark_model.get("projection")
-    views, own = (
-        described(each.encodings, Moments.of(each.encodings), projection) for each in (case.second, case.training)
+    """Scores of the landmark drive on lists of the training drive alone, a place's own landmarks barred."""
+    projection = built_map.map.landmark_model.get("projection")
+    views, places = (
+        described(drive.encodings, Moments.of(drive.encodings), projection) for drive in (case.second, case.training)
     )
     from_m = case.second.position_m[(landmarks @ views.T).argmax(axis=1)]
     barred = np.abs(case.training.position_m[:, np.newaxis] - from_m) <= 2.0
-    restored, scorer = weighted(lists(own, landmarks, barred), landmarks, weights), RetrievalScorer()
+    restored, scorer = weighted(lists(places, landmarks, barred), landmarks, weights), RetrievalScorer()
     for view, truth in zip(views, true_images_of(case.second.route(), case.training.route(), 2.0), strict=True):
         scorer.add(restored @ view, truth)
     return scorer.result()
@@ -218,7 +218,7 @@ def rehearsed(
 
 def report() -> Iterator[str]:
     """The lines of the page."""
-    named = cases()
+    all_cases = cases()
     yield "# Landmarks: how many, chosen how"
     yield ""
     yield (
@@ -228,7 +228,7 @@ def report() -> Iterator[str]:
     )
     yield from ("", "Made by `python -m bench.landmarks`.", "", machine())
     yield from ("", "## Accuracy", "", "ANR / R@1, percent.", "")
-    yield from accuracy(named)
+    yield from accuracy(all_cases)
     yield from ("", f"## Time to choose {_N_LANDMARKS}, made-up encodings of {composed.MOST_DIMENSIONS} numbers", "")
     yield from times()
     yield from ("", "## What was tried for lists", "")
@@ -237,7 +237,7 @@ def report() -> Iterator[str]:
         "the training drive alone, by which a way may be chosen; test: what it comes to, looked at once."
     )
     yield ""
-    yield from tried(named["NetVLAD, two seasons"], 300)
+    yield from tried(all_cases["NetVLAD, two seasons"], 300)
 
 
 def main() -> None:

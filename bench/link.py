@@ -25,7 +25,7 @@ class RefusedError(Exception):
 
     Attributes:
         status: The HTTP status.
-        code: Of the problem document; empty where the answer was none.
+        code: Of the problem document; empty where the answer was no such document.
     """
 
     def __init__(self, request: str, status: int, problem: dict[str, Any]) -> None:
@@ -86,29 +86,29 @@ class Link:
             GoneError: No whole answer came.
             RefusedError: The answer was an error.
         """
-        sent = {} if headers is None else dict(headers)
+        fields = {} if headers is None else dict(headers)
         if isinstance(body, Mapping):
-            body, sent = json.dumps(body).encode(), {"Content-Type": JSON, **sent}
+            body, fields = json.dumps(body).encode(), {"Content-Type": JSON, **fields}
         lines = [f"{method} {path} HTTP/1.1", f"Host: {self._host}", f"Content-Length: {len(body)}"]
-        lines += [f"{name}: {value}" for name, value in sent.items()]
+        lines += [f"{name}: {value}" for name, value in fields.items()]
         try:
-            status, about, answer = self._exchange("\r\n".join([*lines, "", ""]).encode() + body)
+            status, answer_headers, answer = self._exchange("\r\n".join([*lines, "", ""]).encode() + body)
         except (OSError, ValueError, IndexError) as error:
             self._close()
             raise GoneError(f"{method} {path}: {error!r}") from error
-        is_json = about.get(b"content-type", b"").partition(b";")[0].endswith(b"json")
+        is_json = answer_headers.get(b"content-type", b"").partition(b";")[0].endswith(b"json")
         if status >= BAD_REQUEST:
             problem = json.loads(answer) if is_json else {"body": repr(answer[:200])}
             raise RefusedError(f"{method} {path}", status, problem)
         return json.loads(answer) if is_json and answer else answer or None
 
     def upload(
-        self, domain: str, traverse: str, position_m: np.ndarray, encodings: np.ndarray, **more: np.ndarray
+        self, domain: str, traverse: str, position_m: np.ndarray, encodings: np.ndarray, **arrays: np.ndarray
     ) -> None:
-        """Make a traverse of frames 0, 1, ..., of which perhaps more is known."""
+        """Make a traverse of frames 0, 1, ...; `arrays` are further arrays of a batch, such as `x_m`."""
         path = f"/v1/admin/domains/{domain}/traverses"
         self.ask("POST", path, {"name": traverse})
-        batch = packed(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **more)
+        batch = packed(encodings=encodings, index=np.arange(len(encodings)), position_m=position_m, **arrays)
         self.ask("POST", f"{path}/{traverse}/frames", batch, NPZ)
 
     def remap(self, domain: str, config: Mapping[str, Any]) -> dict[str, Any]:

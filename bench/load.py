@@ -62,12 +62,12 @@ class Load:
 
     Attributes:
         seconds: How long the robots drove.
-        observation_s: Of every observation, all robots together.
-        n_requests: Answered as they should be.
+        observation_s: Seconds of every observation, all robots together.
+        n_requests: Requests answered as they should be.
         errors: Everything else, in words.
         n_remaps: Remaps that succeeded.
         n_rollbacks: Activations of another version.
-        samples: The process, in order.
+        samples: Of the service's process, in order.
     """
 
     seconds: float
@@ -139,9 +139,9 @@ class LoadRobot(Driver):
             self.ask(link, "DELETE", f"/v1/sessions/{self._session_id}")
             self._session_id = ""
         else:
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             self._observe(link)
-            spent = time.perf_counter() - began
+            spent = time.perf_counter() - start_s
             self._result.observation_s.append(spent)
             self._stopped.wait(max(0.0, self._every_s * self._rng.uniform(0.8, 1.2) - spent))
 
@@ -168,11 +168,11 @@ class Operator(Driver):
 
     def act(self, link: Link) -> None:
         """One round."""
-        before = self.ask(link, "GET", f"/v1/domains/{DOMAIN}")["map_version"]
+        earlier_version = self.ask(link, "GET", f"/v1/domains/{DOMAIN}")["map_version"]
         job = link.remap(DOMAIN, remap_config(self._episodes))
         self._result.n_remaps += 1
-        made = job["result"]["map_version"]
-        for version, expected in ((before, made), (made, before)):
+        new_version = job["result"]["map_version"]
+        for version, expected in ((earlier_version, new_version), (new_version, earlier_version)):
             self._stopped.wait(self._every_s / 4)
             self.ask(link, "PUT", f"{BASE}/active-map", {"version": version, "expected": expected})
             self._result.n_rollbacks += 1
@@ -196,10 +196,10 @@ def load(
     Args:
         data_dir: An empty folder.
         seconds: How long.
-        observe_every_s: Of every robot.
-        remap_every_s: Of the operator, beside the remaps' own time.
+        observe_every_s: Seconds between two observations of a robot.
+        remap_every_s: Seconds between two remaps, beside their own time.
         episodes: Of every remap's training.
-        on_sample: Told of the run now and then.
+        on_sample: Called with the run now and then.
     """
     stop, result = threading.Event(), Load(seconds)
     with LocalServer(data_dir, environment={"DEEPSIMBAD_LOG_LEVEL": "WARNING"}) as server:
@@ -266,19 +266,21 @@ def main() -> None:
     parser.add_argument("--observe-every", type=float, default=1.0, metavar="SECONDS")
     parser.add_argument("--remap-every", type=float, default=60.0, metavar="SECONDS")
     parser.add_argument("--out", type=Path, help="write the report here as well")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
 
     def tell(result: Load) -> None:
-        now = result.samples[-1]
-        print(f"\r{len(result.observation_s)} observations, {now.rss_mb:.0f} MB ", end="", file=sys.stderr, flush=True)
+        sample = result.samples[-1]
+        print(
+            f"\r{len(result.observation_s)} observations, {sample.rss_mb:.0f} MB ", end="", file=sys.stderr, flush=True
+        )
 
     with tempfile.TemporaryDirectory() as folder:
-        paces = (60 * given.minutes, given.observe_every, given.remap_every)
+        paces = (60 * arguments.minutes, arguments.observe_every, arguments.remap_every)
         result = load(Path(folder) / "data", *paces, on_sample=tell)
-    text = "\n".join(report(result, given.observe_every)) + "\n"
+    text = "\n".join(report(result, arguments.observe_every)) + "\n"
     print(f"\n{text}", end="")
-    if given.out is not None:
-        given.out.write_text(text, encoding="utf-8")
+    if arguments.out is not None:
+        arguments.out.write_text(text, encoding="utf-8")
     sys.exit(1 if result.errors else 0)
 
 

@@ -57,7 +57,7 @@ class World:
 # Whether it is right
 
 
-def mapped(*seasons: Encodings) -> Map:
+def composed_map_of(*seasons: Encodings) -> Map:
     """A map of one season of a route, or of two."""
     drives = [Drive(position_m=np.arange(float(len(season))), encodings=season) for season in seasons]
     second = drives[1] if len(drives) > 1 else None
@@ -67,9 +67,13 @@ def mapped(*seasons: Encodings) -> Map:
 def pieces(name: str, maps: Sequence[Encodings], live: Encodings, length: int, step: int = 3) -> World:
     """Every other stretch of a route is a domain, and those between are none."""
     stretches = range(0, len(live) - length + 1, length)
-    domains = {f"{at}": mapped(*(season[at : at + length] for season in maps)) for at in stretches[::2]}
+    domains = {
+        f"{start}": composed_map_of(*(season[start : start + length] for season in maps)) for start in stretches[::2]
+    }
     views = [
-        (live[i], str(at) if str(at) in domains else None) for at in stretches for i in range(at, at + length, step)
+        (live[i], str(start) if str(start) in domains else None)
+        for start in stretches
+        for i in range(start, start + length, step)
     ]
     return World(name, domains, views)
 
@@ -89,11 +93,11 @@ def worlds(data: Path, work: Path) -> Iterator[World]:
     for seed in (2, 3, 4):
         folder = work / f"campus-{seed}"
         campuses.append([encoded(source) for source in write_campus(folder, ("winter", "summer", "autumn"), 150, seed)])
-    maps = {f"campus {n}": mapped(winter, summer) for n, (winter, summer, _) in enumerate(campuses[:2])}
+    maps = {f"campus {n}": composed_map_of(winter, summer) for n, (winter, summer, _) in enumerate(campuses[:2])}
     maps |= {
-        "corridor": mapped(query),
-        "railway, short": mapped(winter[:150]),
-        "railway, long": mapped(winter[300:1300]),
+        "corridor": composed_map_of(query),
+        "railway, short": composed_map_of(winter[:150]),
+        "railway, long": composed_map_of(winter[300:1300]),
     }
     views = [
         (view, f"campus {n}" if n < 2 else None) for n, (*_, autumn) in enumerate(campuses) for view in autumn[::3]
@@ -113,27 +117,29 @@ def worlds(data: Path, work: Path) -> Iterator[World]:
 
 
 def encoded(source: str) -> Encodings:
-    """By the default extractor."""
+    """[n, d] encodings of a source by the default extractor."""
     evaluator = make_evaluator(evaluator_config({"kind": "feature_l2"}))
     return encode_recording(open_source(source), evaluator, 50_000_000, lambda _: None).drive.encodings
 
 
 def quality_lines(data: Path, work: Path) -> Iterator[str]:
-    """Two tables."""
-    told: list[tuple[float, bool]] = []
+    """Lines of two tables: how often the true domain is the likeliest, and how often at which probability."""
+    likeliest: list[tuple[float, bool]] = []
     rows = []
     for world in worlds(data, work):
         atlas, names = Atlas(list(world.maps.values())), list(world.maps)
         right, on_route, off_route = [], [], []
         for view, truth in world.views:
-            probabilities, elsewhere = posterior(dict(zip(names, atlas.log_evidences(view).tolist(), strict=True)))
+            probabilities, elsewhere_probability = posterior(
+                dict(zip(names, atlas.log_evidences(view).tolist(), strict=True))
+            )
             best = max(probabilities, key=lambda name: probabilities[name])
             if truth is None:
-                off_route.append(elsewhere)
+                off_route.append(elsewhere_probability)
                 continue
             right.append(best == truth)
-            on_route.append(elsewhere)
-            told.append((probabilities[best], best == truth))
+            on_route.append(elsewhere_probability)
+            likeliest.append((probabilities[best], best == truth))
         bar = float(np.quantile(on_route, 0.95))
         rows.append(
             (
@@ -154,13 +160,13 @@ def quality_lines(data: Path, work: Path) -> Iterator[str]:
         "How often the likeliest domain is the true one, of all views of domains, by the probability told:",
         "",
     )
-    chance, is_right = np.array([p for p, _ in told]), np.array([ok for _, ok in told])
+    chance, is_right = np.array([p for p, _ in likeliest]), np.array([ok for _, ok in likeliest])
     table = []
     for low, high in pairwise(BOUNDS):
-        within = (chance > low) & (chance <= high)
-        if within.any():
-            mean, share = f"{100 * chance[within].mean():.0f} %", f"{100 * is_right[within].mean():.0f} %"
-            table.append((f"{low:g} .. {high:g}", int(within.sum()), mean, share))
+        in_range = (chance > low) & (chance <= high)
+        if in_range.any():
+            mean, share = f"{100 * chance[in_range].mean():.0f} %", f"{100 * is_right[in_range].mean():.0f} %"
+            table.append((f"{low:g} .. {high:g}", int(in_range.sum()), mean, share))
     yield from markdown(("told", "views", "mean told", "true"), table)
 
 
@@ -168,26 +174,26 @@ def quality_lines(data: Path, work: Path) -> Iterator[str]:
 
 
 def speed_lines() -> Iterator[str]:
-    """Of answers after encoding, evidences alone and the whole posterior with five domains in full."""
+    """Lines on the time of the posterior over many domains, after encoding."""
     rng = np.random.default_rng(0)
     base = composed_map(scattered_lists(N_IMAGES))
     landmarks = base.landmark_model["prototypes"]
 
     def maps(n: int, d: int | None, is_shared: bool) -> list[Map]:
-        """Of encodings of 96 numbers, or of d that each map projects by itself."""
-        made = []
+        """Maps for encodings of 96 numbers, or of d numbers that each map projects by itself."""
+        made_maps = []
         for _ in range(n):
             model: dict[str, Any] = {"prototypes": landmarks if is_shared else unit(rng.normal(size=landmarks.shape))}
-            usual = base.usual_encoding
+            usual_encoding = base.usual_encoding
             if d is not None:
                 model["projection"] = rng.normal(size=(d, 96)).astype(np.float32)
-                usual = np.stack([np.zeros(d), np.ones(d)]).astype(np.float32)
+                usual_encoding = np.stack([np.zeros(d), np.ones(d)]).astype(np.float32)
             lists = np.ascontiguousarray(np.roll(base.lists, int(rng.integers(N_IMAGES)), axis=1))
-            made.append(replace(base, lists=lists, landmark_model=model, usual_encoding=usual))
-        return made
+            made_maps.append(replace(base, lists=lists, landmark_model=model, usual_encoding=usual_encoding))
+        return made_maps
 
     rows = []
-    for what, n, d, is_shared in (
+    for name, n, d, is_shared in (
         ("landmarks of their own, encodings of 96 numbers", N_DOMAINS, None, False),
         ("one landmark model", N_DOMAINS, None, True),
         ("8,064 numbers, projected by every domain", 100, 8064, False),
@@ -200,7 +206,7 @@ def speed_lines() -> Iterator[str]:
             posterior(dict(zip(names, atlas.log_evidences(view).tolist(), strict=True)))
 
         timing = timed(ask, 60, 5)
-        rows.append((what, n, str(timing), duration(timing.median_s / n)))
+        rows.append((name, n, str(timing), duration(timing.median_s / n)))
     yield from markdown((f"domains of {N_IMAGES:,} map images", "how many", "one view of all", "a domain"), rows)
 
 
@@ -210,8 +216,8 @@ def speed_lines() -> Iterator[str]:
 def write_domains(data_dir: Path, n: int) -> None:
     """Domains of 200 map images each, straight into catalog and folders: distinct files, later hard links."""
     encodings = np.random.default_rng(0).normal(size=(200, 64)).astype(np.float32)
-    map_ = replace(mapped(encodings), evaluator={"kind": "feature_l2", "extractor": "none"})
-    at, digest, n_bytes = current_moment(), "", 0
+    map_ = replace(composed_map_of(encodings), evaluator={"kind": "feature_l2", "extractor": "none"})
+    moment, digest, n_bytes = current_moment(), "", 0
     domains, versions = [], []
     with Catalog.open(data_dir) as catalog:
         for number in range(n):
@@ -226,8 +232,8 @@ def write_domains(data_dir: Path, n: int) -> None:
                 distinct = path
             else:
                 os.link(distinct, path)
-            domains.append((name, '{"extractor":"none","kind":"feature_l2"}', 0, "[1.0,2.0]", at, 2))
-            versions.append((name, 1, "active", at, digest, n_bytes, '{"relevance":"composed"}', "{}", at))
+            domains.append((name, '{"extractor":"none","kind":"feature_l2"}', 0, "[1.0,2.0]", moment, 2))
+            versions.append((name, 1, "active", moment, digest, n_bytes, '{"relevance":"composed"}', "{}", moment))
         with catalog._writing() as db:
             into = "domain (name, evaluator, closed, actions_m, created_at, next_version)"
             db.conn.executemany(f"INSERT INTO {into} VALUES (?, ?, ?, ?, ?, ?)", domains)  # noqa: S608
@@ -236,7 +242,7 @@ def write_domains(data_dir: Path, n: int) -> None:
 
 
 def directory_lines(n: int, work: Path) -> Iterator[str]:
-    """Start, memory, cold and warm answers of a service on it, beside one of a single domain."""
+    """Lines on start, memory, cold and warm answers of a service of n domains, beside one of a single domain."""
     figures: dict[str, dict[int, str]] = {}
     n_bytes = {}
     view = np.random.default_rng(1).normal(size=64).tolist()
@@ -245,9 +251,9 @@ def directory_lines(n: int, work: Path) -> Iterator[str]:
         if not folder.exists():
             write_domains(folder, n_made)
         for _ in range(2):  # the first start of an installation compiles
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             with LocalServer(folder) as server, Client(server.url) as client:
-                ready_s = time.perf_counter() - began
+                ready_s = time.perf_counter() - start_s
                 n_bytes[n_made] = resident_bytes(server.pid)
 
                 def ask(name: str, client: Client = client) -> None:
@@ -256,8 +262,12 @@ def directory_lines(n: int, work: Path) -> Iterator[str]:
                 warm = timed(lambda: ask("d000000"), 300, 20)
                 numbers = np.random.default_rng(2).permutation(np.arange(min(n_made, 1000), min(n_made, N_DISTINCT)))
                 cold_s = [timed(lambda: ask(f"d{number:06}"), 1, 0).median_s for number in numbers[:400]]  # noqa: B023
-                some = [f"d{number:06}" for number in numbers[:400]]
-                together = timed(lambda: client.localize_anywhere(encoding=view, domains=some), 20, 2) if some else None  # noqa: B023
+                domains = [f"d{number:06}" for number in numbers[:400]]
+
+                def ask_all(domains: Sequence[str] = domains, client: Client = client) -> None:
+                    client.localize_anywhere(encoding=view, domains=domains)
+
+                together = timed(ask_all, 20, 2) if domains else None
         figures.setdefault("ready after", {})[n_made] = duration(ready_s)
         figures.setdefault("memory when ready", {})[n_made] = f"{n_bytes[n_made] / 2**20:.0f} MiB"
         figures.setdefault("warm answer", {})[n_made] = str(warm)
@@ -267,13 +277,13 @@ def directory_lines(n: int, work: Path) -> Iterator[str]:
             }
             figures["one view of 400 of them"] = {n_made: str(together)}
     yield from (machine(), "", f"Load when it ended: {os.getloadavg()[0]:.1f}. Files lie in the system's cache.", "")
-    rows = ((what, *(found.get(count, "") for count in (1, n))) for what, found in figures.items())
+    rows = ((figure, *(values.get(count, "") for count in (1, n))) for figure, values in figures.items())
     yield from markdown(("", "one domain", f"{n:,} domains"), rows)
     yield from ("", f"Memory of a further domain: {(n_bytes[n] - n_bytes[1]) / n / 1000:.2f} kB.")
 
 
 def resident_bytes(pid: int) -> int:
-    """Of a process."""
+    """Resident memory of a process."""
     fields = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
     return int(fields[1]) * os.sysconf("SC_PAGE_SIZE")
 
@@ -309,13 +319,13 @@ if __name__ == "__main__":
     parser.add_argument("--domains", type=int)
     parser.add_argument("--work", type=Path)
     parser.add_argument("--speed", action="store_true", help="print the speed alone")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = given.work or Path(temporary)
-        if given.speed:
+        folder = arguments.work or Path(temporary)
+        if arguments.speed:
             print("\n".join(speed_lines()))
-        elif given.domains is not None:
-            for line in directory_lines(given.domains, folder):
+        elif arguments.domains is not None:
+            for line in directory_lines(arguments.domains, folder):
                 print(line, flush=True)
         else:
             write_page("many-domains.md", page(real_recordings(), folder))

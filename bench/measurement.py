@@ -31,12 +31,12 @@ def machine() -> str:
 
 def write_page(name: str, lines: Iterable[str]) -> None:
     """Print the lines as they come, then write them as a page of docs/results."""
-    written = []
+    page_lines = []
     for line in lines:
         print(line, flush=True)
-        written.append(line)
+        page_lines.append(line)
     page = PROJECT / "docs" / "results" / name
-    page.write_text("\n".join(written) + "\n", encoding="utf-8")
+    page.write_text("\n".join(page_lines) + "\n", encoding="utf-8")
     print(f"written to {page}", file=sys.stderr)
 
 
@@ -84,9 +84,9 @@ def interleaved(runs: Sequence[Callable[[], object]], repeats: int, warm_up: int
 
 
 def _seconds(run: Callable[[], object]) -> float:
-    began = perf_counter()
+    start_s = perf_counter()
     run()
-    return perf_counter() - began
+    return perf_counter() - start_s
 
 
 def real_recordings() -> Path:
@@ -111,7 +111,7 @@ class Limit:
 
     @property
     def is_kept(self) -> bool:
-        """A figure that could not be taken keeps no limit."""
+        """Whether the figure is within the limit; one that is not finite is not."""
         return math.isfinite(self.figure) and self.figure <= self.at_most
 
     def __str__(self) -> str:
@@ -126,6 +126,6 @@ def limit_table(limits: Sequence[Limit]) -> Iterator[str]:
 
 
 def breaches(limits: Sequence[Limit]) -> str | None:
-    """What is over, on one line, for a command to end with; None where all is kept."""
+    """The limits that are not kept, on one line, for a command to end with; None where all are kept."""
     over = [str(limit) for limit in limits if not limit.is_kept]
     return f"over the limit: {'; '.join(over)}" if over else None

@@ -74,37 +74,37 @@ class Row:
 
     runtime: Runtime
     batch: int
-    ours: Timing
+    extractor: Timing
     bare: Timing
 
     @property
     def share(self) -> float:
-        """Our throughput beside the bare network's."""
-        return _ratio(self.bare, self.ours)
+        """The extractor's throughput divided by the bare network's."""
+        return _ratio(self.bare, self.extractor)
 
 
 def _ratio(slow: Timing, fast: Timing) -> float:
-    """Paired call by call: a neighbour's load hits both."""
-    return float(np.median([one / other for one, other in zip(slow.seconds, fast.seconds, strict=True)]))
+    """Median ratio of calls paired in turn, since other load on the machine hits both."""
+    return float(np.median([slow_s / fast_s for slow_s, fast_s in zip(slow.seconds, fast.seconds, strict=True)]))
 
 
 def measure(device: Device, batch: int, repeats: int) -> Iterator[Row]:
     """Ours and bare in both number formats, all four in turn."""
     calls: list[Callable[[], object]] = []
     for runtime in RUNTIMES:
-        calls += [ours(runtime, device, batch), bare(runtime, device, batch)]
+        calls += [extractor_call(runtime, device, batch), bare_call(runtime, device, batch)]
     timings = interleaved(calls, repeats, warm_up=2)
     for runtime, first in zip(RUNTIMES, range(0, len(timings), 2), strict=True):
         yield Row(runtime, batch, timings[first], timings[first + 1])
 
 
-def ours(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
+def extractor_call(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
     run = make_run(made_up, Compute(runtime, device, largest_batch=batch), (WIDTH, HEIGHT))
     pixels = np.random.default_rng(0).integers(0, 256, (batch, HEIGHT, WIDTH, 3), dtype=np.uint8)
     return lambda: run(pixels)
 
 
-def bare(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
+def bare_call(runtime: Runtime, device: Device, batch: int) -> Callable[[], object]:
     network = Bare(made_up()).eval().requires_grad_(False)
     dtype = RUNTIMES[runtime]
     network.trunk.to(dtype)
@@ -129,9 +129,9 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
             (
                 NAMES[row.runtime],
                 row.batch,
-                row.ours,
+                row.extractor,
                 row.bare,
-                f"{row.batch / row.ours.median_s:.3g}",
+                f"{row.batch / row.extractor.median_s:.3g}",
                 f"**{row.share:.0%}**",
             )
             for row in rows
@@ -140,9 +140,9 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     yield ""
     for single, half in zip(rows[::2], rows[1::2], strict=True):
         pairs = {
-            "ours against ours": (single.ours, half.ours),
+            "ours against ours": (single.extractor, half.extractor),
             "bare against bare": (single.bare, half.bare),
-            "ours against bare layers in float32": (single.bare, half.ours),
+            "ours against bare layers in float32": (single.bare, half.extractor),
         }
         gains = "; ".join(f"{name} **{_ratio(*pair):.2f}** times" for name, pair in pairs.items())
         yield f"bfloat16 beside float32, batch {single.batch}: {gains}."

@@ -34,7 +34,7 @@ LANDMARK_DRIVE, HELD_OUT, ITSELF, TEST_DRIVE = "landmark traverse", "held-out fr
 
 @dataclass(frozen=True)
 class Setup:
-    """How views are compared and believed; the belief's blur as the service does it where none is named."""
+    """How views are compared and update the belief; `motion_std_m` None: as the service does it."""
 
     name: str
     relevance: Relevance
@@ -55,29 +55,29 @@ class Triplet:
     setup: Setup
 
     @cached_property
-    def _mapped(self) -> tuple[Built, list[Drive]]:
+    def _map_and_drives(self) -> tuple[Built, list[Drive]]:
         evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
         encodings = [np.load(self.folder / f"{name}.npy").astype(np.float32) for name in self.names]
         drives = [Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in encodings]
         plan = MapPlan(self.setup.relevance, LIST_LENGTH, tuple(ACTIONS_M), same_route=True)
-        built = build(plan, drives[1], drives[0], drives[0], N_LANDMARKS, evaluator)
-        return built, [measure_drive(drive, built.map.landmark_model, evaluator) for drive in drives]
+        built_map = build(plan, drives[1], drives[0], drives[0], N_LANDMARKS, evaluator)
+        return built_map, [measure_drive(drive, built_map.map.landmark_model, evaluator) for drive in drives]
 
     def learn(self, live: str, config: NnqlConfig, pool: Executor) -> NDArray[np.float32]:
         """Q-values learnt from some live images; `held-out frames` and `landmark traverse` as a remap does."""
-        built, (landmarks, own, test) = self._mapped
+        built_map, (landmarks, training, test) = self._map_and_drives
         config = replace(config, update=self.setup.update, motion_std_m=self.setup.motion_std_m)
         if live in {LANDMARK_DRIVE, HELD_OUT}:
             second = landmarks if live == LANDMARK_DRIVE else None
-            return train_nnql(built.rehearsal, own, second, config, lambda _: None, 2)[0]
-        drive, map_ = (test, built.map) if live == TEST_DRIVE else (own, built.rehearsal)
+            return train_nnql(built_map.rehearsal, training, second, config, lambda _: None, 2)[0]
+        drive, map_ = (test, built_map.map) if live == TEST_DRIVE else (training, built_map.rehearsal)
         return train(world_of(map_, drive, np.arange(drive.n_frames), config), config, lambda _: None, pool)[0]
 
     def test_world(self, config: NnqlConfig) -> TrainingWorld:
         """The test traverse, to be walked on the map that would serve."""
-        built, (_, _, test) = self._mapped
+        built_map, (_, _, test) = self._map_and_drives
         config = replace(config, update=self.setup.update, motion_std_m=self.setup.motion_std_m)
-        return world_of(built.map, test, np.arange(test.n_frames), config)
+        return world_of(built_map.map, test, np.arange(test.n_frames), config)
 
 
 def score(ranks: NDArray[np.float64], n_images: int) -> NDArray[np.float64]:
@@ -93,12 +93,12 @@ def starts_of(world: TrainingWorld) -> NDArray[np.int64]:
 def greedy(
     world: TrainingWorld, q_values: NDArray[np.float32], config: NnqlConfig, pool: Executor
 ) -> NDArray[np.float64]:
-    """Episodes that follow Q-values."""
+    """[episodes] ANR in percent of episodes that follow Q-values."""
     return score(walk_greedily(world, starts_of(world), q_values, config, pool), world.n_images)
 
 
 def constant(world: TrainingWorld, action: int, pool: Executor) -> NDArray[np.float64]:
-    """Episodes of one move, the action's place."""
+    """[episodes] ANR in percent of episodes that repeat one action, given by its index."""
     walk = Walk(world, starts_of(world), pool)
     ranks = np.empty((N_STARTS, 10))
     for step in range(10):
@@ -169,18 +169,21 @@ def measure(triplets: Sequence[Triplet], setting: Setting, pool: Executor, seed:
     return np.stack(scores)
 
 
-def difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> str:
+def difference(scores: NDArray[np.float64], rival_scores: NDArray[np.float64]) -> str:
     """Mean paired difference and its interval over the starts, in points of ANR; negative: the first is better."""
-    apart = ours.mean(axis=0) - theirs.mean(axis=0)
-    low, high = mean_interval(apart, seed=0)
+    differences = scores.mean(axis=0) - rival_scores.mean(axis=0)
+    low, high = mean_interval(differences, seed=0)
     mark = "**" if high < 0 else ""
-    return f"{mark}{apart.mean():+.3f}{mark} ({low:+.3f} .. {high:+.3f})"
+    return f"{mark}{differences.mean():+.3f}{mark} ({low:+.3f} .. {high:+.3f})"
 
 
 def setup_lines(folder: Path, setup: Setup, pool: Executor) -> Iterator[str]:
     """The tables of one set-up."""
     config, triplets = NnqlConfig(), [Triplet(folder, names, setup) for names in TRIPLETS]
-    names, worlds = ["-".join(triplet.names) for triplet in triplets], [each.test_world(config) for each in triplets]
+    names, worlds = (
+        ["-".join(triplet.names) for triplet in triplets],
+        [triplet.test_world(config) for triplet in triplets],
+    )
     unlearnt = [initial_q_values(world.n_images, world.n_actions, config) for world in worlds]  # random moves
     random = np.stack([greedy(world, values, config, pool) for world, values in zip(worlds, unlearnt, strict=True)])
     constants = np.stack([[constant(world, action, pool) for world in worlds] for action in range(10)])
@@ -215,20 +218,20 @@ def setup_lines(folder: Path, setup: Setup, pool: Executor) -> Iterator[str]:
     yield ""
     # Nobody knows the test traverse beforehand, so a setting that learns from it is none to choose.
     possible = [setting.label for setting in SETTINGS if setting.live not in {TEST_DRIVE, ITSELF}]
-    chosen, reported = list(CHOSEN_ON), list(REPORTED_ON)
-    label = min(possible, key=lambda label: float(learnt[label][chosen].mean()))
-    action = int(constants[:, chosen].mean(axis=(1, 2)).argmin())
+    chosen_on, reported_on = list(CHOSEN_ON), list(REPORTED_ON)
+    label = min(possible, key=lambda label: float(learnt[label][chosen_on].mean()))
+    action = int(constants[:, chosen_on].mean(axis=(1, 2)).argmin())
     scores, rivals = learnt[label], {"random moves": random, f"constant {action + 1} m": constants[action]}
     yield (
-        f"Best possible setting on {', '.join(names[place] for place in chosen)}: **{label}**, ANR "
-        f"{scores[chosen].mean():.3f}, against {random[chosen].mean():.3f} of random moves and "
-        f"{constants[action][chosen].mean():.3f} of constant {action + 1} m, the best there. On the other three, "
-        f"{', '.join(names[place] for place in reported)}:"
+        f"Best possible setting on {', '.join(names[place] for place in chosen_on)}: **{label}**, ANR "
+        f"{scores[chosen_on].mean():.3f}, against {random[chosen_on].mean():.3f} of random moves and "
+        f"{constants[action][chosen_on].mean():.3f} of constant {action + 1} m, the best there. On the other three, "
+        f"{', '.join(names[place] for place in reported_on)}:"
     )
     yield ""
-    rows = [["NNQL with that setting", f"{scores[reported].mean():.3f}", ""]]
+    rows = [["NNQL with that setting", f"{scores[reported_on].mean():.3f}", ""]]
     for name, rival in rivals.items():
-        rows.append([name, f"{rival[reported].mean():.3f}", difference(scores[reported], rival[reported])])
+        rows.append([name, f"{rival[reported_on].mean():.3f}", difference(scores[reported_on], rival[reported_on])])
     yield from markdown(("", "ANR, mean", "NNQL less it, 95 % interval"), rows)
     yield ""
 

@@ -36,7 +36,7 @@ _LEAST_GREY_STD = 8.0
 
 @dataclass(frozen=True)
 class Measured:
-    """The client's own summary of every relevance's replay; what was left out of frames 0..999 and 1000..1999."""
+    """The client's summary of every relevance's replay, and how many frames of map and landmarks were left out."""
 
     summaries: dict[str, dict[str, Any]]
     n_map_frames_left_out: int
@@ -75,14 +75,14 @@ def drive_folders(nordland: Path, work: Path, n_frames: int = N_FRAMES) -> tuple
         n_frames: How many of the frames of map and landmarks to take, from the first on.
     """
     summer, winter = nordland / "summer", nordland / "winter"
-    kept = kept_frames((summer, winter), MAP_FRAMES[:n_frames])
-    candidates = kept_frames((summer,), LANDMARK_FRAMES[:n_frames])
+    map_frames = kept_frames((summer, winter), MAP_FRAMES[:n_frames])
+    landmark_frames = kept_frames((summer,), LANDMARK_FRAMES[:n_frames])
     drives = {
-        "landmarks": season_folder(work / "landmarks", summer, candidates, LANDMARK_FRAMES.start),
-        "map": season_folder(work / "map", summer, kept, MAP_FRAMES.start),
-        "live": season_folder(work / "live", winter, kept, MAP_FRAMES.start),
+        "landmarks": season_folder(work / "landmarks", summer, landmark_frames, LANDMARK_FRAMES.start),
+        "map": season_folder(work / "map", summer, map_frames, MAP_FRAMES.start),
+        "live": season_folder(work / "live", winter, map_frames, MAP_FRAMES.start),
     }
-    return drives, n_frames - len(kept), n_frames - len(candidates)
+    return drives, n_frames - len(map_frames), n_frames - len(landmark_frames)
 
 
 def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES, n_frames: int = N_FRAMES) -> Measured:
@@ -101,15 +101,15 @@ def measure(nordland: Path, work: Path, relevances: tuple[str, ...] = RELEVANCES
         for relevance in relevances:
             remap(client, DOMAIN, "map", relevance=relevance, **REMAP)
             # One query at a time: the time an answer takes is then the service's, not a queue's.
-            driven = replay(client, live, DOMAIN, work / relevance, tolerance_m=TOLERANCE_M, concurrency=1)
-            summaries[relevance] = summarise(driven)
+            drive_replay = replay(client, live, DOMAIN, work / relevance, tolerance_m=TOLERANCE_M, concurrency=1)
+            summaries[relevance] = summarise(drive_replay)
         evaluator = client.domain(DOMAIN).evaluator
     extractor = evaluator["extractor"] if isinstance(evaluator, dict) else str(evaluator)
     return Measured(summaries, n_map_left_out, n_landmarks_left_out, extractor)
 
 
 def make_domain(client: Client, drives: dict[str, Path]) -> None:
-    """The domain, and the traverses `landmarks` and `map`."""
+    """Make the domain, and upload the traverses `landmarks` and `map`."""
     client.admin.put_domain(DOMAIN, {"kind": "feature_l2"})
     for name in ("landmarks", "map"):
         upload(client, open_source(str(drives[name])), DOMAIN, name)

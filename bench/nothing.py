@@ -32,7 +32,7 @@ N_FRAMES, N_VIEWS, N_LANDMARKS, SIZE = 24, 60, 300, (240, 320)
 
 
 def made_up() -> dict[str, list[Image]]:
-    """Frames by kind."""
+    """Made-up frames by kind."""
     rng = np.random.default_rng(0)
 
     def grained(grain: float, level: float, spread: float) -> Image:
@@ -58,8 +58,8 @@ def made_up() -> dict[str, list[Image]]:
     return kinds
 
 
-def told(map_: Map, evaluator: Evaluator, frames: list[Image], n_views: int) -> tuple[float, float]:
-    """Share of views, a metre apart, that are said to tell nothing; greatest knowledge of the belief in bits."""
+def informative_views(map_: Map, evaluator: Evaluator, frames: list[Image], n_views: int) -> tuple[float, float]:
+    """Share of views, a metre apart, that are said to tell nothing, and the belief's greatest knowledge in bits."""
     localizer = ActiveLocalizer(map_, LocalizerConfig(planner="constant:5"))
     state, n_nothing, least_bits = localizer.start(), 0, np.inf
     cells = map_.route.cell_m / map_.route.cell_m.sum()
@@ -78,7 +78,7 @@ def _images(folder: Path, count: int) -> list[Image]:
 
 
 def _encoded(evaluator: Evaluator, images: list[Image]) -> NDArray[np.float32]:
-    return np.concatenate([evaluator.encode(images[at : at + 8]) for at in range(0, len(images), 8)])
+    return np.concatenate([evaluator.encode(images[first : first + 8]) for first in range(0, len(images), 8)])
 
 
 def lines() -> Iterator[str]:
@@ -92,16 +92,16 @@ def lines() -> Iterator[str]:
     for extractor in EXTRACTORS:
         evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": extractor}))
         rows: dict[str, list[str]] = {}
-        for mapped, driven, count in drives.values():
-            encodings = _encoded(evaluator, _images(mapped, count))
+        for map_folder, live_folder, count in drives.values():
+            encodings = _encoded(evaluator, _images(map_folder, count))
             training = Drive(position_m=np.arange(float(len(encodings))), encodings=encodings)
             plan = MapPlan(DEFAULT_RELEVANCE, 4, ACTIONS_M)
             map_ = compose_map(plan, training, None, None, min(N_LANDMARKS, count // 2)).map
             for kind, frames in kinds.items():
-                share, bits = told(map_, evaluator, frames, N_VIEWS)
+                share, bits = informative_views(map_, evaluator, frames, N_VIEWS)
                 rows.setdefault(kind, []).extend((f"{100 * share:.0f}", f"{bits:.1f}"))
-            frames = _images(driven, count)
-            share, _ = told(map_, evaluator, frames, len(frames))
+            frames = _images(live_folder, count)
+            share, _ = informative_views(map_, evaluator, frames, len(frames))
             rows.setdefault("real, another season or walk", []).extend((f"{100 * share:.1f}", ""))
         yield from ("", f"## `{extractor}`", "")
         head = [column for name in drives for column in (f"{name}: told nothing, %", "bits known at most")]

@@ -61,7 +61,7 @@ class Drives:
     is_of_two_seasons: bool
 
     def map(self, relevance: Relevance, n_landmarks: int) -> Map:
-        """Built of the training drive."""
+        """The map of the training drive."""
         landmarks, training = (
             Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in (self.landmarks, self.training)
         )
@@ -70,19 +70,19 @@ class Drives:
         return build(plan, training, second, landmarks, n_landmarks, _EVALUATOR).map
 
 
-def ranked(drives: Drives, built: Map, m: int) -> list[PackedRanks]:
-    """What a robot sends of every test frame, by its m nearest landmarks."""
+def ranked(drives: Drives, map_: Map, m: int) -> list[PackedRanks]:
+    """Bodies that a robot sends of the test frames, each its m nearest landmarks."""
     test = Drive(position_m=np.arange(float(len(drives.test))), encodings=drives.test)
-    ranks = views_of(measure_drive(test, built.landmark_model, _EVALUATOR)).ranks
-    return [PackedRanks(pack_ranked_landmarks(np.argsort(row)[:m].tolist(), built.n_landmarks)) for row in ranks]
+    ranks = views_of(measure_drive(test, map_.landmark_model, _EVALUATOR)).ranks
+    return [PackedRanks(pack_ranked_landmarks(np.argsort(row)[:m].tolist(), map_.n_landmarks)) for row in ranks]
 
 
-def encoded(drives: Drives, built: Map, n_bits: int) -> list[PackedUnitEncoding]:
-    """The same by its unit encoding."""
-    return [PackedUnitEncoding(pack_unit_encoding(u, n_bits)) for u in unit_vectors(drives.test, built.landmark_model)]
+def encoded(drives: Drives, map_: Map, n_bits: int) -> list[PackedUnitEncoding]:
+    """Bodies that a robot sends of the test frames, each its unit encoding at some bits a number."""
+    return [PackedUnitEncoding(pack_unit_encoding(u, n_bits)) for u in unit_vectors(drives.test, map_.landmark_model)]
 
 
-def anr(drives: Drives, built: Map, views: Iterable[Packed], how: str) -> float:
+def anr(drives: Drives, map_: Map, views: Iterable[Packed], statistics: str) -> float:
     """ANR in percent over the test drive.
 
     Args:
@@ -91,12 +91,12 @@ def anr(drives: Drives, built: Map, views: Iterable[Packed], how: str) -> float:
         views: What was sent of every test frame.
         how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's.
     """
-    scorer, live = RetrievalScorer(), built.live_statistics
+    scorer, live = RetrievalScorer(), map_.live_statistics
     for frame, view in enumerate(views):
-        query = describe(built, _EVALUATOR, view)
-        live = live.observing(query) if live is not None and how == "session" else live
+        query = describe(map_, _EVALUATOR, view)
+        live = live.observing(query) if live is not None and statistics == "session" else live
         truths = np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE)
-        scorer.add(relevances(built, query, live), truths)
+        scorer.add(relevances(map_, query, live), truths)
     return scorer.result().anr
 
 
@@ -112,13 +112,13 @@ def netvlad(folder: Path) -> list[Drives]:
 def nordland(folder: Path) -> list[Drives]:
     """Landmarks from summer frames 1000..1999, the map from summer 0..999, live images from winter 0..999."""
     summer, winter = folder / "summer", folder / "winter"
-    kept, candidates = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
+    map_frames, landmark_frames = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
     evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "efficientnet_lite0"}))
     landmarks, training, test = (
         _encoded(evaluator, season, numbers)
-        for season, numbers in ((summer, candidates), (summer, kept), (winter, kept))
+        for season, numbers in ((summer, landmark_frames), (summer, map_frames), (winter, map_frames))
     )
-    return [Drives(landmarks, training, test, np.array(kept), False)]
+    return [Drives(landmarks, training, test, np.array(map_frames), False)]
 
 
 def _encoded(evaluator: Evaluator, season: Path, numbers: Sequence[int]) -> NDArray[np.float32]:
@@ -150,19 +150,19 @@ def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
 
 
 def _measured(
-    columns: Sequence[tuple[Sequence[tuple[Drives, Map]], str]], sent: Callable[[Drives, Map], Sequence[Packed]]
+    columns: Sequence[tuple[Sequence[tuple[Drives, Map]], str]], pack: Callable[[Drives, Map], Sequence[Packed]]
 ) -> tuple[str, list[float]]:
     """The bytes of a body, bold where the budget holds it, and the ANR of every column."""
-    n_bytes = len(sent(*columns[0][0][0])[0].body)
+    n_bytes = len(pack(*columns[0][0][0])[0].body)
     means = [
-        float(np.mean([anr(drives, built, sent(drives, built), how) for drives, built in maps]))
-        for maps, how in columns
+        float(np.mean([anr(drives, map_, pack(drives, map_), statistics) for drives, map_ in maps]))
+        for maps, statistics in columns
     ]
     return f"**{n_bytes}**" if n_bytes <= BUDGET_BYTES else str(n_bytes), means
 
 
 def _cost(mean: float, best: float | None) -> str:
-    """How much worse than all ranks; nothing where these are all ranks."""
+    """How much worse a mean is than that of all ranks, in percent; empty where there is none to compare with."""
     return "" if best is None else f" ({100 * (mean / best - 1):+.0f} %)"
 
 

@@ -24,17 +24,17 @@ READY = ("--evaluator", "feature_l2:none")  # of files of encodings
 
 
 def measured(part: str, drives: list[str], folder: Path, options: list[str]) -> dict[str, dict[str, Any]]:
-    """What the experiment prints of every order."""
+    """The experiment's document of every order, by its name; those in the folder are not run again."""
     folder.mkdir(parents=True, exist_ok=True)
     documents = {}
     for landmarks, training, test in itertools.permutations(drives):
         name = " ".join(Path(drive).stem for drive in (landmarks, training, test))
         path = folder / f"{part}-{name.replace(' ', '-')}.json"
         if not path.exists():
-            given = ["--landmarks", landmarks, "--training", training, "--test", test]
-            given += READY if test.endswith(".npy") else ()
-            given += [option.replace("MAP", training) for option in options]
-            command = [sys.executable, "-m", "deepsimbad", "experiment", part, *given, "--json", str(path)]
+            arguments = ["--landmarks", landmarks, "--training", training, "--test", test]
+            arguments += READY if test.endswith(".npy") else ()
+            arguments += [option.replace("MAP", training) for option in options]
+            command = [sys.executable, "-m", "deepsimbad", "experiment", part, *arguments, "--json", str(path)]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - our own command
         documents[name] = json.loads(path.read_text(encoding="utf-8"))
         print(f"{len(documents)} of 6: {name}", file=sys.stderr)
@@ -42,13 +42,13 @@ def measured(part: str, drives: list[str], folder: Path, options: list[str]) -> 
 
 
 def vpr_lines(documents: Documents) -> Iterator[str]:
-    """By relevance; and what a drive in order comes to, by window."""
+    """Tables by relevance, and of drives in order by window."""
     for title, of in (("R@1 %", "recall_at_1"), ("R@5 %", "recall_at_5")):
         rows = []
         for name in next(iter(documents.values()))["anr"]:
             anr = [document["anr"][name] for document in documents.values()]
             recall = [document[of][name] for document in documents.values()]
-            rows.append([name, f"{np.mean(anr):.2f}", f"{np.mean(recall):.1f}", *(f"{each:.2f}" for each in anr)])
+            rows.append([name, f"{np.mean(anr):.2f}", f"{np.mean(recall):.1f}", *(f"{value:.2f}" for value in anr)])
         yield from markdown(["relevance", "ANR %", title, *documents], rows)
         yield ""
     passive = [document["passive"] for document in documents.values() if document["passive"]]
@@ -59,16 +59,17 @@ def vpr_lines(documents: Documents) -> Iterator[str]:
 
 
 def _of_window(passive: Sequence[dict[str, Any]], name: str, window: str) -> str:
-    """Means over all windows of all orders."""
-    n_queries = [each["n_queries"][window] for each in passive]
+    """Mean ANR and R@1 of a window, over all windows of all orders."""
+    n_queries = [document["n_queries"][window] for document in passive]
     anr, recall = (
-        np.average([each[of][name][window] for each in passive], weights=n_queries) for of in ("anr", "recall_at_1")
+        np.average([document[of][name][window] for document in passive], weights=n_queries)
+        for of in ("anr", "recall_at_1")
     )
     return f"{anr:.3f} / {recall:.1f}"
 
 
 def nbv_lines(documents: Documents) -> Iterator[str]:
-    """By planner; and the default against each order's best constant move."""
+    """Tables by planner, and of the default against each order's best constant move."""
     tables = ("views_to_confident", "metres_to_confident", "wrong_when_confident", "anr", "anr_paper")
     planners = list(next(iter(documents.values()))["anr"])
     means = {
@@ -81,21 +82,24 @@ def nbv_lines(documents: Documents) -> Iterator[str]:
     ]
     yield from markdown(["planner", "views", "metres", "sure and wrong, %", "ANR, %", "ANR as in the paper, %"], rows)
     yield ""
-    rows, found = [], []
+    rows, comparisons = [], []
     for order, document in documents.items():
         best, default, views = document["best_constant"], document["default"], document["views_to_confident"]
         low, high = document["views_difference_95"][f"{default} - {best}"]
         rows.append([order, best, f"{views[best]:.2f}", f"{views[default]:.2f}", f"{low:+.2f} .. {high:+.2f}"])
-        found.append((views[best], views[default], (high - low) / 2))
-    taken, taken_by_default, halves = np.array(found).T
-    apart, half = float((taken_by_default - taken).mean()), float(np.sqrt(np.square(halves).sum()) / len(halves))
-    together = f"{apart - half:+.2f} .. {apart + half:+.2f}"
-    rows.append(["all, as if independent", "", f"{taken.mean():.2f}", f"{taken_by_default.mean():.2f}", together])
+        comparisons.append((views[best], views[default], (high - low) / 2))
+    constant_views, default_views, halves = np.array(comparisons).T
+    difference, half = (
+        float((default_views - constant_views).mean()),
+        float(np.sqrt(np.square(halves).sum()) / len(halves)),
+    )
+    together = f"{difference - half:+.2f} .. {difference + half:+.2f}"
+    rows.append(["all, as if independent", "", f"{constant_views.mean():.2f}", f"{default_views.mean():.2f}", together])
     yield from markdown(["order", "best constant", "views it takes", "the default", "difference, 95 %"], rows)
 
 
 def calibration_lines(documents: Documents) -> Iterator[str]:
-    """Coverage by move length; reliability; and every other figure by order."""
+    """Tables of coverage by move length, of reliability, and of every other figure by order."""
     all_of, first = list(documents.values()), next(iter(documents.values()))
     views = list(next(iter(first["coverage_95"].values())))
     rows = []
@@ -112,19 +116,20 @@ def calibration_lines(documents: Documents) -> Iterator[str]:
         )
     yield from markdown(["moves", *(f"after {view}" for view in views), "wrong, %"], rows)
     yield ""
-    held, near = (
+    held_masses, true_shares = (
         np.nanmean(np.array([document["reliability"][of] for document in all_of], float), axis=0)
         for of in ("near_mode", "within_5_m")
     )
     yield from markdown(
-        ["held, %", *(f"{each:.0f}" for each in held)], [["true, %", *(f"{each:.0f}" for each in near)]]
+        ["held, %", *(f"{mass:.0f}" for mass in held_masses)], [["true, %", *(f"{share:.0f}" for share in true_shares)]]
     )
     yield ""
     rows = []
     for of in ("standing_coverage_95", "lost_their_place", "carried", "off_route", "odometry_coverage_95"):
         for key in first[of] if isinstance(first[of], dict) else [None]:
-            each = [document[of] if key is None else document[of][key] for document in all_of]
-            row = [of if key is None else f"{of}: {key}", f"{np.mean(each):.1f}", *(f"{value:.1f}" for value in each)]
+            figures = [document[of] if key is None else document[of][key] for document in all_of]
+            name = of if key is None else f"{of}: {key}"
+            row = [name, f"{np.mean(figures):.1f}", *(f"{figure:.1f}" for figure in figures)]
             rows.append(row)
     refused = [sum(document["views_refused"].values()) for document in all_of]
     rows.append(["views_refused", sum(refused), *refused])
@@ -137,8 +142,8 @@ if __name__ == "__main__":
     parser.add_argument("part", choices=lines)
     parser.add_argument("drives", nargs=3)
     parser.add_argument("--keep", type=Path, required=True, metavar="FOLDER")
-    own, _, passed_on = " ".join(sys.argv[1:]).partition(" -- ")
-    arguments = parser.parse_args(own.split())
+    own_options, _, passed_on = " ".join(sys.argv[1:]).partition(" -- ")
+    arguments = parser.parse_args(own_options.split())
     print(machine())
     print()
     for line in lines[arguments.part](measured(arguments.part, arguments.drives, arguments.keep, passed_on.split())):

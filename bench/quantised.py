@@ -42,7 +42,7 @@ def k_means(rows: NDArray[np.float32], k: int) -> NDArray[np.float32]:
 
 
 def nearest_centre(rows: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.int64]:
-    """[n] by L2."""
+    """[n] index of the centre [k, d] nearest to every row [n, d] by L2."""
     return np.asarray((rows @ centres.T - 0.5 * np.square(centres).sum(axis=1)).argmax(axis=1), np.int64)
 
 
@@ -74,14 +74,17 @@ def netvlad_drives() -> dict[str, Drive]:
     """The three drives of `nordland_netvlad64`, a place a metre."""
     folder = real_recordings() / "nordland_netvlad64"
     rows = {name: np.load(folder / f"{name}.npy").astype(np.float32) for name in DRIVES}
-    return {name: Drive(position_m=np.arange(float(len(each))), encodings=each) for name, each in rows.items()}
+    return {
+        name: Drive(position_m=np.arange(float(len(encodings))), encodings=encodings)
+        for name, encodings in rows.items()
+    }
 
 
-def scored(built: Built, places: NDArray[np.float32], test: Drive) -> RetrievalScores:
-    """One session over the test drive against restored places."""
-    truth = true_images_of(test.route(), built.map.route, TOLERANCE)
-    views = views_of(measure_drive(test, built.map.landmark_model, FeatureL2("none")))
-    rows = relevances_by_all(replace(built, places=places), views, moves_between(test), stateless=False)
+def scored(built_map: Built, places: NDArray[np.float32], test: Drive) -> RetrievalScores:
+    """Scores of one session over the test drive against restored places [n, k]."""
+    truth = true_images_of(test.route(), built_map.map.route, TOLERANCE)
+    views = views_of(measure_drive(test, built_map.map.landmark_model, FeatureL2("none")))
+    rows = relevances_by_all(replace(built_map, places=places), views, moves_between(test), stateless=False)
     scorer = RetrievalScorer()
     for row, true_images in zip(rows, truth, strict=True):
         scorer.add(row, true_images)
@@ -90,8 +93,8 @@ def scored(built: Built, places: NDArray[np.float32], test: Drive) -> RetrievalS
 
 def row_of(scores: list[RetrievalScores]) -> list[str]:
     """Mean ANR and R@1, and the worst ANR, in percent."""
-    anr = [each.anr for each in scores]
-    return [f"{np.mean(anr):.2f}", f"{np.mean([each.recall_at[1] for each in scores]):.1f}", f"{max(anr):.2f}"]
+    anr = [score.anr for score in scores]
+    return [f"{np.mean(anr):.2f}", f"{np.mean([score.recall_at[1] for score in scores]):.1f}", f"{max(anr):.2f}"]
 
 
 def report() -> Iterator[str]:
@@ -114,23 +117,27 @@ def report() -> Iterator[str]:
             second = landmarks if has_two else None
             plan = MapPlan(Relevance.COMPOSED, LIST_LENGTH, (1.0,), same_route=True)
             for r in N_LANDMARKS:
-                built = compose_map(plan, training, second, second, r)
-                places, d = built.places, built.places.shape[1]
+                built_map = compose_map(plan, training, second, second, r)
+                places, d = built_map.places, built_map.places.shape[1]
                 bits = f"{4 * np.log2(r):.0f}"
                 for name, numbers, restored in (
-                    ("composed", r * d, composed_places(built.map.lists, built.map.landmark_model["prototypes"])),
+                    (
+                        "composed",
+                        r * d,
+                        composed_places(built_map.map.lists, built_map.map.landmark_model["prototypes"]),
+                    ),
                     ("product quantisation, 4 parts", r * d, product_quantised(places, 4, r)),
                     ("residual quantisation, 4 parts", 4 * r * d, residual_quantised(places, 4, r)),
                 ):
-                    scores.setdefault((name, bits, f"{numbers:,}"), []).append(scored(built, restored, test))
+                    scores.setdefault((name, bits, f"{numbers:,}"), []).append(scored(built_map, restored, test))
             for name, numbers, restored in (
                 ("product quantisation, 6 parts", 64 * d, product_quantised(places, 6, 64)),
                 ("residual quantisation, 6 parts", 6 * 64 * d, residual_quantised(places, 6, 64)),
                 ("nothing left out", 0, places),
             ):
                 bits = "36" if numbers else f"{32 * d:,}"
-                scores.setdefault((name, bits, f"{numbers:,}"), []).append(scored(built, restored, test))
-        rows = [(*about, *row_of(each)) for about, each in scores.items()]
+                scores.setdefault((name, bits, f"{numbers:,}"), []).append(scored(built_map, restored, test))
+        rows = [(*description, *row_of(rows_scores)) for description, rows_scores in scores.items()]
         yield from markdown(("description", "bits", "numbers", "ANR %", "R@1 %", "worst ANR %"), rows)
 
 

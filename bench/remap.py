@@ -56,37 +56,37 @@ class RemapFigures:
     """What was measured.
 
     Attributes:
-        size: Of what.
-        alone: A remap that nobody asks beside.
-        beside: One beside the robots.
-        robots: They.
-        idle: What each met with before that remap.
-        during: And while it went on.
+        size: How much there was to do.
+        alone: A remap while nobody else asks.
+        under_load: A remap while the robots ask.
+        robots: The robots.
+        idle: The waits of each robot before that remap.
+        during: The waits of each robot while it went on.
     """
 
     size: RemapSize
     alone: Remapped
-    beside: Remapped
+    under_load: Remapped
     robots: Sequence[LiveRobot]
     idle: Sequence[Waits]
     during: Sequence[Waits]
 
     def limits(self) -> list[Limit]:
-        """What must be kept."""
+        """The limits of the figures."""
         limits = [
             Limit("remap, seconds", self.alone.seconds, MOST_SECONDS),
-            Limit("remap beside the robots, seconds", self.beside.seconds, MOST_SECONDS_UNDER_LOAD),
+            Limit("remap beside the robots, seconds", self.under_load.seconds, MOST_SECONDS_UNDER_LOAD),
         ]
-        for robot, before, after in zip(self.robots, self.idle, self.during, strict=True):
-            for share, name, most in ((0.5, "median", MOST_MEDIAN_RATIO), (0.99, "p99", MOST_P99_RATIO)):
-                ratio = after.quantile_s(share) / before.quantile_s(share)
-                limits.append(Limit(f"{robot.name}: {name} ratio", ratio, most))
-            limits.append(Limit(f"{robot.name}: failures", len(before.failures) + len(after.failures), 0))
+        for robot, idle, busy in zip(self.robots, self.idle, self.during, strict=True):
+            for share, name, limit in ((0.5, "median", MOST_MEDIAN_RATIO), (0.99, "p99", MOST_P99_RATIO)):
+                ratio = busy.quantile_s(share) / idle.quantile_s(share)
+                limits.append(Limit(f"{robot.name}: {name} ratio", ratio, limit))
+            limits.append(Limit(f"{robot.name}: failures", len(idle.failures) + len(busy.failures), 0))
         return limits
 
 
 def measured(size: RemapSize) -> RemapFigures:
-    """Measure a service of its own."""
+    """Measure on a service of its own."""
     with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
         with Client(server.url) as client:
             client.admin.put_domain(_DOMAIN, {"kind": "feature_l2", "extractor": "none"})
@@ -122,10 +122,10 @@ def _robots(size: RemapSize) -> list[LiveRobot]:
 
 def _remapped(url: str, domain: str, episodes: int) -> Remapped:
     config = {"training_traverse": "training", "landmark_traverse": "landmarks", "n_landmarks": N_LANDMARKS}
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     with Link(url) as link:
         job = link.remap(domain, {**config, "training_episodes": episodes})
-    return Remapped(time.perf_counter() - began, job["result"]["metrics"]["seconds"])
+    return Remapped(time.perf_counter() - start_s, job["result"]["metrics"]["seconds"])
 
 
 def report(figures: RemapFigures) -> Iterator[str]:
@@ -145,15 +145,15 @@ def report(figures: RemapFigures) -> Iterator[str]:
     yield (
         f"{len(figures.robots)} robots meanwhile, with {pauses} ms between an answer and the next request, on the map "
         f"of before; the pictures on a domain of its own with {size.n_frames:,} map images. "
-        f"The remap took {figures.beside.seconds:.1f} s beside them."
+        f"The remap took {figures.under_load.seconds:.1f} s beside them."
     )
     yield ""
     rows = []
-    for robot, before, after in zip(figures.robots, figures.idle, figures.during, strict=True):
-        failures = [*before.failures, *after.failures]
+    for robot, idle, busy in zip(figures.robots, figures.idle, figures.during, strict=True):
+        failures = [*idle.failures, *busy.failures]
         kinds = f" ({', '.join(sorted(set(failures)))})" if failures else ""
-        share = f"{len(failures)}{kinds} of {len(before.seconds) + len(after.seconds)}"
-        rows.append((robot.name, before, after, share, " then ".join(map(str, after.map_versions))))
+        share = f"{len(failures)}{kinds} of {len(idle.seconds) + len(busy.seconds)}"
+        rows.append((robot.name, idle, busy, share, " then ".join(map(str, busy.map_versions))))
     head = ("robot", "idle: median, p99", "during the next remap: median, p99", "failures", "map versions")
     yield from markdown(head, rows)
     yield ""
@@ -167,14 +167,14 @@ def remap_table() -> Iterator[str]:
 
 def main() -> None:
     """Print the table; ends with 1 where a limit is not kept."""
-    usual = RemapSize()
+    default = RemapSize()
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=usual.n_frames)
-    parser.add_argument("--candidates", type=int, default=usual.n_candidates)
-    parser.add_argument("--episodes", type=int, default=usual.episodes)
-    parser.add_argument("--idle", type=float, default=usual.idle_s, metavar="SECONDS")
-    given = parser.parse_args()
-    figures = measured(RemapSize(given.frames, given.candidates, given.episodes, given.idle))
+    parser.add_argument("--frames", type=int, default=default.n_frames)
+    parser.add_argument("--candidates", type=int, default=default.n_candidates)
+    parser.add_argument("--episodes", type=int, default=default.episodes)
+    parser.add_argument("--idle", type=float, default=default.idle_s, metavar="SECONDS")
+    arguments = parser.parse_args()
+    figures = measured(RemapSize(arguments.frames, arguments.candidates, arguments.episodes, arguments.idle))
     print("\n".join(report(figures)), flush=True)
     sys.exit(breaches(figures.limits()))
 

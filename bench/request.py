@@ -23,14 +23,14 @@ DOMAIN = "/v1/admin/domains/d"
 
 def main() -> None:
     """Print the median of every turn."""
-    here = Path(__file__).resolve().parents[1]
+    project = Path(__file__).resolve().parents[1]
     for turn in range(N_TURNS):
-        for checkout in [*map(Path, sys.argv[1:]), here]:
+        for checkout in [*map(Path, sys.argv[1:]), project]:
             folders = (checkout.resolve() / name for name in ("service", "client", "migrations"))
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
             command = [sys.executable, __file__, "--measure"]
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - itself
-            print(f"turn {turn + 1}, {checkout}: {float(done.stdout):.2f} ms")
+            process = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - itself
+            print(f"turn {turn + 1}, {checkout}: {float(process.stdout):.2f} ms")
 
 
 def measure() -> None:
@@ -51,8 +51,8 @@ async def _seconds() -> list[float]:
         httpx2.AsyncClient(transport=transport, base_url="http://127.0.0.1", timeout=120) as client,
     ):
 
-        async def call(method: str, path: str, **more: object) -> dict[str, object]:
-            answer = await client.request(method, path, **more)
+        async def call(method: str, path: str, **options: object) -> dict[str, object]:
+            answer = await client.request(method, path, **options)
             answer.raise_for_status()
             return answer.json()
 
@@ -73,9 +73,9 @@ async def _seconds() -> list[float]:
         seconds = []
         for _ in range(N_WARM + N_MEASURED):
             body = json.dumps({"ranked_landmarks": rng.permutation(N_LANDMARKS).tolist()})
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             await call("POST", path, content=body, headers={"Content-Type": "application/json"})
-            seconds.append(time.perf_counter() - began)
+            seconds.append(time.perf_counter() - start_s)
     return seconds
 
 

@@ -23,9 +23,9 @@ class LiveRobot:
 
     Attributes:
         name: What it does, in a table.
-        domain: Where it is.
-        bodies: What it sends, in turn.
-        media_type: Of them.
+        domain: Name of the domain where it is.
+        bodies: The bodies that it sends, in turn.
+        media_type: Of the bodies.
         session_length: Moves of 1 m in a session, then another one: the route has an end. 0: it asks without a session.
         pause_s: Seconds between an answer and its next request.
     """
@@ -43,10 +43,10 @@ class Waits:
     """What one robot met with.
 
     Attributes:
-        seconds: Of every answer.
+        seconds: From every request to its answer.
         failures: Status and code of answers that were no belief.
-        map_versions: Of the answers, as they came, changes alone.
-        timings_ms: Of every tenth answer, as the service tells them.
+        map_versions: Of the answers, as they came, without repetitions.
+        timings_ms: Of every tenth answer, as the service gives them.
         session_id: Its last session; empty: none.
     """
 
@@ -80,13 +80,13 @@ def _ask(url: str, is_over: Callable[[Waits], bool], robot: LiveRobot) -> Waits:
                 waits.session_id = link.ask("POST", f"/v1/domains/{robot.domain}/sessions", {})["session_id"]
                 path = f"/v1/sessions/{waits.session_id}/observations?action_m=1"
             key = {"Idempotency-Key": f"view-{number}"} if robot.session_length else {}
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             try:
                 answer = link.ask("POST", path, robot.bodies[number % len(robot.bodies)], headers | key)
             except RefusedError as error:
                 answer = None
                 waits.failures.append(f"{error.status} {error.code}")
-            waits.seconds.append(time.perf_counter() - began)
+            waits.seconds.append(time.perf_counter() - start_s)
             if answer is not None and waits.map_versions[-1:] != [answer["map_version"]]:
                 waits.map_versions.append(answer["map_version"])
             if answer is not None and number % 10 == 0:

@@ -42,7 +42,7 @@ class Parameters:
     map_bytes: int = 3 * MEBIBYTE  # of a file
     loaded_bytes: int = 4 * MEBIBYTE  # of a map in memory
     memory_bytes: int = 4096 * MEBIBYTE  # of a replica, for maps
-    disk_bytes: int = 64 * 1024 * MEBIBYTE  # likewise
+    disk_bytes: int = 64 * 1024 * MEBIBYTE  # of a replica, for files of maps
 
 
 BEGIN_S = 600.0
@@ -51,16 +51,16 @@ BEGIN_S = 600.0
 class Cache:
     """Domains within a number of bytes, the least recently used leaving first."""
 
-    def __init__(self, n_bytes: int, each: int) -> None:
-        self._most, self._held = n_bytes // each, OrderedDict[int, None]()
+    def __init__(self, n_bytes: int, domain_bytes: int) -> None:
+        self._n_domains, self._domains = n_bytes // domain_bytes, OrderedDict[int, None]()
 
     def has(self, domain: int) -> bool:
-        """Whether it was there; it is from now on."""
-        was_there = domain in self._held
-        self._held[domain] = None
-        self._held.move_to_end(domain)
-        if len(self._held) > self._most:
-            self._held.popitem(last=False)
+        """Whether a domain was in the cache; it is from now on."""
+        was_there = domain in self._domains
+        self._domains[domain] = None
+        self._domains.move_to_end(domain)
+        if len(self._domains) > self._n_domains:
+            self._domains.popitem(last=False)
         return was_there
 
 
@@ -77,13 +77,13 @@ class Replica:
 
     @classmethod
     def empty(cls, of: Parameters) -> "Replica":
-        """As it starts."""
+        """A replica as it starts."""
         return cls(Cache(of.memory_bytes, of.loaded_bytes), Cache(of.disk_bytes, of.map_bytes))
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What robots and replicas saw."""
+    """The figures of one run."""
 
     answer_ms: np.ndarray  # of every observation, waiting counted
     n_loaded: int
@@ -98,7 +98,7 @@ def simulated(of: Parameters, seed: int = 0) -> Outcome:
     popularity = np.cumsum(np.arange(1, of.n_domains + 1) ** -of.zipf)
     end_s, dies_s = 3600 * of.hours, 1800 * of.hours
     replicas = [Replica.empty(of) for _ in range(of.n_replicas)]
-    placed: dict[int, tuple[int, ...]] = {}
+    owners_of: dict[int, tuple[int, ...]] = {}
     domain, until_s = np.zeros(of.n_robots, np.int64), np.zeros(of.n_robots)
     due = [(float(rng.uniform(0, BEGIN_S)), robot) for robot in range(of.n_robots)]
     heapq.heapify(due)
@@ -112,9 +112,9 @@ def simulated(of: Parameters, seed: int = 0) -> Outcome:
             domain[robot] = np.searchsorted(popularity, rng.uniform(0, popularity[-1]))
             until_s[robot] = now_s + of.drive_s * rng.uniform(0.5, 1.5)
         route = int(domain[robot])
-        if route not in placed:
-            placed[route] = owners(f"{route:08x}", of.n_replicas)
-        number, other = placed[route][robot % 2], placed[route][1 - robot % 2]
+        if route not in owners_of:
+            owners_of[route] = owners(f"{route:08x}", of.n_replicas)
+        number, other = owners_of[route][robot % 2], owners_of[route][1 - robot % 2]
         is_away = number == 0 and dies_s <= now_s < dies_s + of.away_s
         replica = replicas[other if is_away else number]
         takes_ms = of.answer_ms
@@ -124,16 +124,16 @@ def simulated(of: Parameters, seed: int = 0) -> Outcome:
             if not replica.disk.has(route):
                 takes_ms += of.fetch_ms
                 counts["fetched"] += 1
-        moved = not is_new and robot not in replica.sessions
+        is_moved = not is_new and robot not in replica.sessions
         replica.sessions.add(robot)
-        if moved:
+        if is_moved:
             replica.followed_at_s = max(now_s, replica.followed_at_s) + of.replay_ms / 1000
             counts["moved"] += 1
         begins_s = max(now_s, replica.free_at_s)
         replica.free_at_s = begins_s + takes_ms / 1000
         replica.busy_s += takes_ms / 1000
         if now_s >= BEGIN_S:
-            answer_ms.append(1000 * (max(replica.free_at_s, replica.followed_at_s if moved else 0.0) - now_s))
+            answer_ms.append(1000 * (max(replica.free_at_s, replica.followed_at_s if is_moved else 0.0) - now_s))
         heapq.heapreplace(due, (now_s + of.every_s * rng.uniform(0.9, 1.1), robot))
     busy = sum(replica.busy_s for replica in replicas) / (of.n_replicas * end_s)
     return Outcome(np.array(answer_ms), counts["loaded"], counts["fetched"], counts["moved"], busy)
@@ -141,19 +141,19 @@ def simulated(of: Parameters, seed: int = 0) -> Outcome:
 
 def lines() -> Iterator[str]:
     """The page."""
-    usual = Parameters()
+    default = Parameters()
     runs = {
-        "as told": usual,
-        "twice the robots": replace(usual, n_robots=2 * usual.n_robots),
-        "256 MiB of memory for maps": replace(usual, memory_bytes=256 * MEBIBYTE),
-        "4 replicas": replace(usual, n_replicas=4),
-        "all routes alike": replace(usual, zipf=0.0),
-        "the store ten times slower": replace(usual, fetch_ms=10 * usual.fetch_ms),
+        "as told": default,
+        "twice the robots": replace(default, n_robots=2 * default.n_robots),
+        "256 MiB of memory for maps": replace(default, memory_bytes=256 * MEBIBYTE),
+        "4 replicas": replace(default, n_replicas=4),
+        "all routes alike": replace(default, zipf=0.0),
+        "the store ten times slower": replace(default, fetch_ms=10 * default.fetch_ms),
     }
     yield from ("# 100,000 domains, 10^9 map images: a simulation", "", "`python -m bench.scale`", "")
     yield from ((__doc__ or "").split("\n\n", 2)[2].strip(), "")
     yield "Parameters (where they were measured: [scale.md](../scale.md)):"
-    yield from ("", *(f"- {name.replace('_', ' ')}: {value:,}" for name, value in vars(usual).items()), "")
+    yield from ("", *(f"- {name.replace('_', ' ')}: {value:,}" for name, value in vars(default).items()), "")
     yield from markdown(
         ("run", "observations", "median", "p99", "p99.9", "worst", "busy", "from disk", "from the store", "moved"),
         (row(name, simulated(of)) for name, of in runs.items()),
@@ -165,11 +165,11 @@ def lines() -> Iterator[str]:
     yield "how often a session went on with a replica that had to follow its journal first, there and back."
 
 
-def row(name: str, seen: Outcome) -> tuple[str, ...]:
+def row(name: str, outcome: Outcome) -> tuple[str, ...]:
     """One run's figures."""
-    times = (f"{np.percentile(seen.answer_ms, share):,.1f}" for share in (50, 99, 99.9, 100))
-    counts = (f"{count:,}" for count in (seen.n_loaded, seen.n_fetched, seen.n_moved))
-    return name, f"{seen.answer_ms.size:,}", *times, f"{seen.busy:.0%}", *counts
+    times = (f"{np.percentile(outcome.answer_ms, share):,.1f}" for share in (50, 99, 99.9, 100))
+    counts = (f"{count:,}" for count in (outcome.n_loaded, outcome.n_fetched, outcome.n_moved))
+    return name, f"{outcome.answer_ms.size:,}", *times, f"{outcome.busy:.0%}", *counts
 
 
 if __name__ == "__main__":

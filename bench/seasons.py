@@ -38,9 +38,9 @@ def lines(sources: Sequence[str]) -> Iterator[str]:
     """The table."""
     yield from (machine(), "", f"`python -m bench.seasons {' '.join(sources)}`", "")
     scores: dict[str, list[tuple[RetrievalScores, RetrievalScores]]] = {kind: [] for kind in KINDS}
-    for test, compared in worlds(sources):
-        for kind, map_ in compared:
-            scores[kind].append((driven(map_, test, stateless=False), driven(map_, test, stateless=True)))
+    for test, maps_by_kind in worlds(sources):
+        for kind, map_ in maps_by_kind:
+            scores[kind].append((scores_of(map_, test, stateless=False), scores_of(map_, test, stateless=True)))
     yield from markdown(
         ("map of", "orders", "one session: ANR / R@1 / worst ANR", "every view on its own"),
         ((kind, len(rows), *map(figures, zip(*rows, strict=True))) for kind, rows in scores.items() if rows),
@@ -85,8 +85,8 @@ def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]
     yield KINDS[0], map_
     drives = [(training, True)]
     for kind, season in zip((KINDS[1], KINDS[3]), seasons, strict=False):
-        known = KnownDrives.of(map_, drives, training)
-        fused = None if known is None else fuse(map_, known, season, same_route=True)[0]
+        known_drives = KnownDrives.of(map_, drives, training)
+        fused = None if known_drives is None else fuse(map_, known_drives, season, same_route=True)[0]
         if fused is None:
             raise SystemExit("these are no drives of one route")
         map_ = fused.map
@@ -96,8 +96,8 @@ def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]
         yield KINDS[2], compose_map(PLAN, training, seasons[0], seasons[0], n_landmarks).map
 
 
-def driven(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
-    """One session over the drive, or every view by itself."""
+def scores_of(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
+    """Scores of one session over the drive, or of every view by itself."""
     scorer, live = RetrievalScorer(), map_.live_statistics
     truths = true_images_of(test.route(), map_.route, TOLERANCE_M)
     for encoding, truth in zip(test.encodings, truths, strict=True):
@@ -108,7 +108,7 @@ def driven(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
 
 
 def figures(scores: Sequence[RetrievalScores]) -> str:
-    """Means, and the worst ANR, in percent."""
+    """Mean ANR, mean R@1 and the worst ANR, in percent."""
     anr = [score.anr for score in scores]
     return f"{np.mean(anr):.2f} / {np.mean([score.recall_at[1] for score in scores]):.1f} / {max(anr):.2f}"
 

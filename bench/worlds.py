@@ -43,8 +43,8 @@ def dense_lists(n_images: int, smoothness: float = 0.99) -> NDArray[np.uint16]:
     return lists
 
 
-def standardised_map(lists: NDArray[np.uint16], **more: Any) -> Map:
-    """A map of these lists, five images a metre, for a relevance of ours; `more` of its fields."""
+def standardised_map(lists: NDArray[np.uint16], **fields: Any) -> Map:
+    """A map of these lists, five images a metre, for a relevance of ours; `fields` are further ones of `Map`."""
     dissimilarities = np.random.default_rng(0).random((2000, N_LANDMARKS))
     statistics = LandmarkStatistics.of_map(rank_landmarks(dissimilarities))
     return Map(
@@ -52,30 +52,30 @@ def standardised_map(lists: NDArray[np.uint16], **more: Any) -> Map:
         lists=lists,
         position_m=np.arange(lists.shape[1]) * SPACING_M,
         statistics=np.stack([statistics.mean, statistics.std]),
-        **more,
+        **fields,
     )
 
 
-def composed_map(lists: NDArray[np.uint16], **more: Any) -> Map:
+def composed_map(lists: NDArray[np.uint16], **fields: Any) -> Map:
     """A map of these lists for the default relevance; its landmarks are drawn at random."""
     rng = np.random.default_rng(0)
-    usual = {name: np.stack([np.zeros(n), np.ones(n)]) for name, n in (("encoding", 96), ("product", N_LANDMARKS))}
+    moments = {name: np.stack([np.zeros(n), np.ones(n)]) for name, n in (("encoding", 96), ("product", N_LANDMARKS))}
     return Map(
         config={"relevance": Relevance.COMPOSED.value, "n_landmarks": N_LANDMARKS},
         lists=lists,
         position_m=np.arange(lists.shape[1]) * SPACING_M,
         statistics=np.stack([np.zeros(N_LANDMARKS), np.ones(N_LANDMARKS)]),
-        usual_encoding=usual["encoding"].astype(np.float32),
-        usual_product=usual["product"].astype(np.float32),
+        usual_encoding=moments["encoding"].astype(np.float32),
+        usual_product=moments["product"].astype(np.float32),
         landmark_model={"prototypes": unit(rng.normal(size=(N_LANDMARKS, 96)))},
-        **more,
+        **fields,
     )
 
 
-def rrf_map(lists: NDArray[np.uint16], **more: Any) -> Map:
+def rrf_map(lists: NDArray[np.uint16], **fields: Any) -> Map:
     """A map of these lists for the paper's relevance."""
     config = {"relevance": Relevance.RRF.value, "n_landmarks": N_LANDMARKS}
-    return Map(config=config, lists=lists, position_m=np.arange(lists.shape[1]) * SPACING_M, **more)
+    return Map(config=config, lists=lists, position_m=np.arange(lists.shape[1]) * SPACING_M, **fields)
 
 
 _BLOCK = 1024
@@ -85,8 +85,8 @@ def write_seasons(data_dir: Path, domain: str, n_frames: int, n_candidates: int,
     """Two drives of one wandering route, straight into their files: an upload is not what is measured here.
 
     Args:
-        data_dir: Where the domain is.
-        domain: It has no traverses yet.
+        data_dir: Data directory of the domain.
+        domain: Name of the domain, which has no traverses yet.
         n_frames: Of the traverse `training`.
         n_candidates: Of the traverse `landmarks`, spread over the same route.
         dim: Of an encoding.
@@ -105,14 +105,14 @@ def write_seasons(data_dir: Path, domain: str, n_frames: int, n_candidates: int,
                 place[:] = level
             index = np.arange(start, start + len(places))
             training.put_frames(_season(places, index, index, rng))
-            chosen = np.flatnonzero((frames_of >= start) & (frames_of < start + len(places)))
-            landmarks.put_frames(_season(places[frames_of[chosen] - start], chosen, frames_of[chosen], rng))
+            rows = np.flatnonzero((frames_of >= start) & (frames_of < start + len(places)))
+            landmarks.put_frames(_season(places[frames_of[rows] - start], rows, frames_of[rows], rng))
 
 
 def _season(
     places: NDArray[np.float32], index: NDArray[np.int64], frame: NDArray[np.int64], rng: np.random.Generator
 ) -> Drive:
     """The places as one season shows them: unit vectors, as NetVLAD's are."""
-    seen = places + np.float32(0.7) * rng.standard_normal(places.shape, np.float32)
-    seen = (seen / np.linalg.norm(seen, axis=1, keepdims=True)).astype(np.float32)
-    return Drive(index=index, position_m=frame * SPACING_M, encodings=seen)
+    encodings = places + np.float32(0.7) * rng.standard_normal(places.shape, np.float32)
+    encodings = (encodings / np.linalg.norm(encodings, axis=1, keepdims=True)).astype(np.float32)
+    return Drive(index=index, position_m=frame * SPACING_M, encodings=encodings)

@@ -38,7 +38,7 @@ def report(result: Soak) -> Iterator[str]:
     )
     rows = {
         kills: len(result.ready_s),
-        **{f"acknowledged writes: {who.lower()}": f"{count:,}" for who, count in result.n_acknowledged.items()},
+        **{f"acknowledged writes: {actor.lower()}": f"{count:,}" for actor, count in result.n_acknowledged.items()},
         "acknowledged writes lost": 0,
         "damaged files (`deepsimbad check`, and bit by bit)": 0,
         "remaps that succeeded, many of them across kills": result.n_remaps,
@@ -72,19 +72,19 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="write the report here as well")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = soak(
             Path(folder) / "data",
-            given.kills,
-            given.seed,
-            lambda done: print(f"\r{done} of {given.kills} kills", end="", file=sys.stderr, flush=True),
+            arguments.kills,
+            arguments.seed,
+            lambda n_kills: print(f"\r{n_kills} of {arguments.kills} kills", end="", file=sys.stderr, flush=True),
         )
     text = "\n".join(report(result)) + "\n"
     print(file=sys.stderr)
     print(text, end="")
-    if given.out is not None:
-        given.out.write_text(text, encoding="utf-8")
+    if arguments.out is not None:
+        arguments.out.write_text(text, encoding="utf-8")
     sys.exit(breaches(limits(result)))
 
 

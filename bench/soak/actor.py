@@ -14,9 +14,9 @@ N_IMAGES, N_LANDMARKS, DIM, SPACING_M = 400, 50, 16, 0.5
 DRIVES = ("spring", "summer")
 
 
-def remap_config(training: str, landmarks: str | None, **more: Any) -> dict[str, Any]:
+def remap_config(training: str, landmarks: str | None, **options: Any) -> dict[str, Any]:
     """The body of a remap, small enough to be over in a second."""
-    config = {"training_traverse": training, "landmark_traverse": landmarks, "training_episodes": 200, **more}
+    config = {"training_traverse": training, "landmark_traverse": landmarks, "training_episodes": 200, **options}
     return config if landmarks is None else {**config, "n_landmarks": N_LANDMARKS}
 
 
@@ -41,12 +41,12 @@ def expect(truth: object, loss: str) -> None:
 
 
 class Actor(ABC):
-    """Acts until the service is gone, remembers what it was told, and checks it when the service is back.
+    """Acts until the service is gone, remembers the answers, and checks them when the service is back.
 
     Attributes:
-        doing: What it was about when it last spoke; read at the moment of a kill.
+        doing: What it does now; read at the moment of a kill.
         n_acknowledged: Writes that were answered.
-        rests_s: Between two things it does: all of them together shall not take every core, or no job gets anywhere.
+        rests_s: Seconds between two actions: all actors together shall not take every core, or no job gets anywhere.
     """
 
     doing = "nothing"

@@ -12,10 +12,10 @@ SWITCHES = 6  # between two remaps, on average
 
 
 class Mapper(Actor):
-    """Knows which versions may serve: those that it was told, and those that a request without an answer named.
+    """Knows which versions may serve: those in answers, and those that a request without an answer named.
 
     Args:
-        seed: Of what it chooses.
+        seed: Of its choices.
     """
 
     def __init__(self, seed: int) -> None:
@@ -23,14 +23,14 @@ class Mapper(Actor):
         self._job: dict[str, Any] | None = None
         self._asking = False
         self._may_serve: set[int] = {1}
-        self._ended: dict[str, dict[str, Any]] = {}
+        self._ended_jobs: dict[str, dict[str, Any]] = {}
         self._sealed: dict[int, str] = {}
         self.n_interrupted = 0
 
     @property
     def n_remaps(self) -> int:
         """Remaps that succeeded."""
-        return sum(job["state"] == "succeeded" for job in self._ended.values())
+        return sum(job["state"] == "succeeded" for job in self._ended_jobs.values())
 
     def act(self, link: Link) -> None:
         """Ask for a remap, follow it, or switch versions."""
@@ -52,12 +52,12 @@ class Mapper(Actor):
             self.n_acknowledged += 1
 
     def finish(self, link: Link) -> None:
-        """Nobody kills any more: the remap under way, or one asked for now if none has ended yet, comes to its end."""
-        while self._job is not None or not self._ended:
+        """Wait, once nobody kills any more, for the remap under way, or for one asked for now if none has ended."""
+        while self._job is not None or not self._ended_jobs:
             self.act(link)
 
     def _end(self, link: Link, job: dict[str, Any]) -> None:
-        self._job, self._ended[job["job_id"]] = None, job
+        self._job, self._ended_jobs[job["job_id"]] = None, job
         if job["state"] == "succeeded":
             version = job["result"]["map_version"]
             if job["result"]["active"]:
@@ -71,12 +71,14 @@ class Mapper(Actor):
 
     def _switch(self, link: Link) -> None:
         self.doing = "activating"
-        served = link.ask("GET", f"/v1/domains/{DOMAIN}")["map_version"]
-        there = [record["version"] for record in self._learn_versions(link) if record["removed_at"] is None]
-        version = int(self._rng.choice([version for version in there if version != served] or [served]))
-        self.doing = "activating" if version > served else "rolling back"
-        self._may_serve = {served, version}
-        link.ask("PUT", f"{BASE}/active-map", {"version": version, "expected": served})
+        version_serving = link.ask("GET", f"/v1/domains/{DOMAIN}")["map_version"]
+        versions = [record["version"] for record in self._learn_versions(link) if record["removed_at"] is None]
+        version = int(
+            self._rng.choice([version for version in versions if version != version_serving] or [version_serving])
+        )
+        self.doing = "activating" if version > version_serving else "rolling back"
+        self._may_serve = {version_serving, version}
+        link.ask("PUT", f"{BASE}/active-map", {"version": version, "expected": version_serving})
         self._may_serve = {version}
         self.n_acknowledged += 1
 
@@ -87,22 +89,22 @@ class Mapper(Actor):
         return sealed
 
     def check(self, link: Link) -> None:
-        """What serves is what was told, no sealed version and no job is lost, and the job under way goes on."""
-        served = link.ask("GET", f"/v1/domains/{DOMAIN}")
-        expect(served["map_problem"] is None, f"the map does not answer: {served}")
-        version = served["map_version"]
+        """A version that may serve does, no sealed version and no job is lost, and the job under way goes on."""
+        domain = link.ask("GET", f"/v1/domains/{DOMAIN}")
+        expect(domain["map_problem"] is None, f"the map does not answer: {domain}")
+        version = domain["map_version"]
         records = {record["version"]: record for record in link.ask("GET", f"{BASE}/maps?limit=1000")["maps"]}
-        newer = {made for made in records if made > max(self._sealed, default=0)}
+        newer = {version_ for version_ in records if version_ > max(self._sealed, default=0)}
         allowed = self._may_serve | (newer if self._job is not None or self._asking else set())
         expect(version in allowed, f"map {version} serves, of {sorted(allowed)}")
         expect(records[version]["state"] == "active", f"map {version} serves but is {records[version]['state']}")
         for sealed, digest in self._sealed.items():
             expect(records.get(sealed, {}).get("sha256") == digest, f"map {sealed} is lost or another")
-        for job_id, told in list(self._ended.items())[-5:]:
-            expect(link.ask("GET", f"/v1/admin/jobs/{job_id}") == told, f"job {job_id} has changed its end")
+        for job_id, ended_job in list(self._ended_jobs.items())[-5:]:
+            expect(link.ask("GET", f"/v1/admin/jobs/{job_id}") == ended_job, f"job {job_id} has changed its end")
         if self._asking:  # the job may have been noted without an answer
             jobs = link.ask("GET", f"/v1/admin/jobs?domain={DOMAIN}&limit=1")["jobs"]
-            if jobs and jobs[0]["job_id"] not in self._ended:
+            if jobs and jobs[0]["job_id"] not in self._ended_jobs:
                 self._job = jobs[0]
             self._asking = False
         if self._job is not None:

@@ -21,7 +21,7 @@ class Robot(Actor):
     """One session for as long as it may live; every observation has a key, so that it can be sent again.
 
     Args:
-        number: Of the robot; seeds everything it sees.
+        number: Of the robot; the seed of all its views.
         kind: Its filter.
         session_length: It ends its session after so many observations and begins another; None: never.
     """
@@ -36,7 +36,7 @@ class Robot(Actor):
         self._belief: dict[str, Any] = {}
 
     def ranks(self, view: int) -> list[int]:
-        """What it sees at its n-th view."""
+        """The ranked landmarks of its n-th view."""
         permutation: list[int] = np.random.default_rng([self.number, view]).permutation(N_LANDMARKS).tolist()
         return permutation
 
@@ -61,7 +61,7 @@ class Robot(Actor):
         self.n_acknowledged += 1
 
     def check(self, link: Link) -> None:
-        """The session has every observation that was answered, and the belief that was told."""
+        """The session has every observation that was answered, and the belief of the last answer."""
         if not self._session_id:
             return
         state = link.ask("GET", f"/v1/sessions/{self._session_id}")

@@ -54,9 +54,9 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
 
     Args:
         data_dir: An empty folder.
-        n_kills: How often.
-        seed: Of the moments and of what the others do; the service's own pace makes every run another one all the same.
-        on_kill: Told after each kill how many there were.
+        n_kills: How often it is killed.
+        seed: Of the moments and of the actors; the service's own pace makes every run another one all the same.
+        on_kill: Called after each kill with the number of kills so far.
     """
     rng = np.random.default_rng(seed)
     result = Soak()
@@ -89,8 +89,8 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
                 robot.check_bits(link, data_dir)
         uploader.check_bits(data_dir)
         command = [sys.executable, "-m", "deepsimbad", "check", "--json", "--data-dir", str(data_dir)]
-        checked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
-        expect(checked.returncode == 0, f"deepsimbad check: {checked.stdout} {checked.stderr}")
+        process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
+        expect(process.returncode == 0, f"deepsimbad check: {process.stdout} {process.stderr}")
     finally:
         server.kill()
     for actor in actors:
@@ -100,9 +100,9 @@ def soak(data_dir: Path, n_kills: int, seed: int, on_kill: Callable[[int], None]
 
 
 def _ready(server: LocalServer) -> float:
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     server.start()
-    return time.perf_counter() - began
+    return time.perf_counter() - start_s
 
 
 def _live_and_die(server: LocalServer, actors: list[Actor], aim: str, rng: np.random.Generator) -> None:

@@ -27,23 +27,23 @@ class Uploader(Actor):
         self._is_made = False
         self._n_sent = 0
         self._in_flight: set[int] = set()
-        self._told: dict[int, set[int]] = {}
+        self._acknowledged: dict[int, set[int]] = {}
         self._deleting: int | None = None
         self._deleted: list[int] = []
 
     def act(self, link: Link) -> None:
         """Make a traverse, add frames to it, or delete the oldest."""
-        if self._deleting is not None or len(self._told) > KEPT:
+        if self._deleting is not None or len(self._acknowledged) > KEPT:
             self.doing = "deleting a traverse"
-            self._deleting = self._deleting if self._deleting is not None else min(self._told)
+            self._deleting = self._deleting if self._deleting is not None else min(self._acknowledged)
             _is_there(link, "DELETE", self._deleting)  # or was deleted before the service died
-            self._told.pop(self._deleting, None)
+            self._acknowledged.pop(self._deleting, None)
             self._deleted.append(self._deleting)
             self._deleting = None
         elif not self._is_made:
             self.doing = "making a traverse"
             link.ask("POST", f"{BASE}/traverses", {"name": name_of(self._number)})
-            self._is_made, self._n_sent, self._told[self._number] = True, 0, set()
+            self._is_made, self._n_sent, self._acknowledged[self._number] = True, 0, set()
         elif self._n_sent >= FRAMES:
             self._number, self._is_made = self._number + 1, False
             return
@@ -62,32 +62,35 @@ class Uploader(Actor):
             link.ask("POST", path, packed(encodings=encodings, index=index, position_m=1.0 * index), NPZ)
         else:
             link.ask("PUT", f"{path}/{index[0]}?position_m={index[0]}", {"encoding": encodings[0].tolist()})
-        self._told[self._number] |= self._in_flight
+        self._acknowledged[self._number] |= self._in_flight
         self._in_flight = set()
         self._n_sent = int(index[-1]) + 1
 
     def check(self, link: Link) -> None:
         """No acknowledged frame is missing, no half batch is there, no deleted traverse is back."""
-        for number, told in self._told.items():
+        for number, acknowledged in self._acknowledged.items():
             if number == self._deleting:
                 continue
             answer = link.ask("GET", f"{BASE}/traverses/{name_of(number)}")
-            more = self._in_flight if number == self._number else set()
-            expect(answer["n_frames"] in {len(told), len(told | more)}, f"{name_of(number)}: {answer} of {len(told)}")
+            in_flight = self._in_flight if number == self._number else set()
+            expect(
+                answer["n_frames"] in {len(acknowledged), len(acknowledged | in_flight)},
+                f"{name_of(number)}: {answer} of {len(acknowledged)}",
+            )
             gaps = {index for first, last in answer["missing"] for index in range(first, last + 1)}
-            expect(not gaps & told, f"{name_of(number)} misses frames {sorted(gaps & told)}")
+            expect(not gaps & acknowledged, f"{name_of(number)} misses frames {sorted(gaps & acknowledged)}")
         for number in self._deleted[-3:]:
             expect(not _is_there(link, "GET", number), f"{name_of(number)} was deleted and is back")
 
     def check_bits(self, data_dir: Path) -> None:
         """Every acknowledged frame holds the very numbers that were sent."""
-        for number, told in self._told.items():
+        for number, acknowledged in self._acknowledged.items():
             if number == self._deleting:
                 continue
             with Traverse.open(data_dir, DOMAIN, name_of(number)) as traverse:
                 frames = traverse.read()
             encodings = dict(zip(frames.index.tolist(), frames.encodings, strict=True))
-            for index in told:
+            for index in acknowledged:
                 expect(np.array_equal(encodings[index], encoding(number, index)), f"{name_of(number)} frame {index}")
 
 
@@ -102,5 +105,5 @@ def _is_there(link: Link, method: str, number: int) -> bool:
 
 
 def name_of(number: int) -> str:
-    """Of a traverse."""
+    """Name of a traverse."""
     return f"drive-{number}"
