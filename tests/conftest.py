@@ -17,6 +17,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
+from deepsimbad_campus import camera
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.http import local_server
 
@@ -73,8 +74,12 @@ def shared(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def rendered(shared) -> Path:
-    """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed."""
-    with one_at_a_time(shared, "campus"):
+    """36 frames of a campus in all seasons, in NCLT's layout: rendered once for all test processes, never changed.
+
+    Pictures are half as wide and tall as NCLT's, of which tests decode thousands.
+    """
+    with one_at_a_time(shared, "campus"), pytest.MonkeyPatch.context() as patched:
+        patched.setattr(camera, "UPRIGHT_SIZE", tuple(pixels // 2 for pixels in camera.UPRIGHT_SIZE))
         write_campus(shared / "campus", n_frames=36)  # what is there already is left as it is
     return shared / "campus"
 
