@@ -22,9 +22,9 @@ READY = {"kind": "feature_l2", "extractor": "none"}
 
 @pytest.fixture
 def catalog(tmp_path: Path) -> Iterator[Catalog]:
-    with Catalog.open(tmp_path / "data") as opened:
-        opened.create_domain(DOMAIN, READY, False, (1.0, 2.0))
-        yield opened
+    with Catalog.open(tmp_path / "data") as new_catalog:
+        new_catalog.create_domain(DOMAIN, READY, False, (1.0, 2.0))
+        yield new_catalog
 
 
 @pytest.fixture(scope="session")
@@ -36,14 +36,14 @@ def evaluator() -> Evaluator:
 def drive(catalog: Catalog) -> Callable[..., np.ndarray]:
     """Stores a traverse of random encodings; returns them [n, d]."""
 
-    def store(name: str, n: int, seed: int = 0, position_m: Any = None, d: int = 6, **known: Any) -> np.ndarray:
+    def store(name: str, n: int, seed: int = 0, position_m: Any = None, d: int = 6, **fields: Any) -> np.ndarray:
         encodings = np.random.default_rng(seed).normal(size=(n, d)).astype(np.float32)
         frames = Drive(
             index=np.arange(n),
             position_m=np.arange(n, dtype=float) if position_m is None else np.asarray(position_m, float),
-            timestamp_us=known.get("timestamp_us", np.full(n, UNKNOWN_TIMESTAMP)),
-            x_m=known.get("x_m", np.full(n, np.nan)),
-            y_m=known.get("y_m", np.full(n, np.nan)),
+            timestamp_us=fields.get("timestamp_us", np.full(n, UNKNOWN_TIMESTAMP)),
+            x_m=fields.get("x_m", np.full(n, np.nan)),
+            y_m=fields.get("y_m", np.full(n, np.nan)),
             frame_name=np.array([f"{name}{i}.png" for i in range(n)], np.str_),
             encodings=encodings,
         )

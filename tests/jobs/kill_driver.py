@@ -90,34 +90,34 @@ def content(catalog: Catalog, version: int) -> dict[str, Any]:
     return asdict(replace(read_map(catalog.map_path(DOMAIN, version)), version=0, created_at=""))
 
 
-def check(data_dir: Path, told: Words, wanted: dict[str, Any]) -> None:
-    """Once and only once, by the next service."""
+def check(data_dir: Path, report: Words, expected: dict[str, Any]) -> None:
+    """Check that the next service has done the job, once and only once."""
     serve(data_dir)
     with Catalog.open(data_dir) as catalog:
         jobs = catalog.jobs()
-        expect(len(jobs) == 1 or (not jobs and not told), "the job is there")
+        expect(len(jobs) == 1 or (not jobs and not report), "the job is there")
         expect(catalog.discard_unfinished() == [], "nothing is left to clear away")
         maps = {record.version: record for record in catalog.maps(DOMAIN)}
         expect(len(maps) == 1 + len(jobs), f"one job, one map: {sorted(maps)}")
         for job in jobs:
             expect(job.state is JobState.SUCCEEDED, f"the job has succeeded: {job}")
-            made = maps[(job.result or {})["map_version"]]
-            expect(made.metrics["job_id"] == job.job_id, "the map is the job's")
-            expect(made.state is MapState.ACTIVE, "it serves")
-            verify(catalog.map_path(DOMAIN, made.version), made.sha256 or "")
-            np.testing.assert_equal(content(catalog, made.version), wanted)
+            map_record = maps[(job.result or {})["map_version"]]
+            expect(map_record.metrics["job_id"] == job.job_id, "the map is the job's")
+            expect(map_record.state is MapState.ACTIVE, "it serves")
+            verify(catalog.map_path(DOMAIN, map_record.version), map_record.sha256 or "")
+            np.testing.assert_equal(content(catalog, map_record.version), expected)
         files = sorted(path.name for path in (data_dir / "domains" / DOMAIN / "maps").iterdir())
         expect(files == [f"{version:06d}.sqlite" for version in sorted(maps)], f"no file is left over: {files}")
 
 
-def check_imported(data_dir: Path, whole: bytes) -> None:
-    """The map with its bytes, or nothing of it."""
+def check_imported(data_dir: Path, file_content: bytes) -> None:
+    """Check that the map is there with its bytes, or nothing of it."""
     with Catalog.open(data_dir) as catalog:
         catalog.discard_unfinished()
         maps = catalog.maps(DOMAIN) if catalog.domains() else []
         files = sorted(path.name for path in data_dir.glob("domains/*/maps/*"))
         expect(files == [f"{record.version:06d}.sqlite" for record in maps], f"no file is left over: {files}")
-        expect(all(catalog.map_path(DOMAIN, record.version).read_bytes() == whole for record in maps), "whole")
+        expect(all(catalog.map_path(DOMAIN, record.version).read_bytes() == file_content for record in maps), "whole")
 
 
 def import_it(data_dir: Path, file: Path) -> None:
@@ -134,18 +134,18 @@ def main(folder: Path, kind: str, file_stride: int, stride: int) -> None:
         kill_at_every_step(
             *(folder, plans, lambda data_dir: Catalog.open(data_dir).close()),
             lambda data_dir, tell: import_it(data_dir, file),
-            lambda data_dir, told: check_imported(data_dir, file.read_bytes()),
+            lambda data_dir, report: check_imported(data_dir, file.read_bytes()),
         )
         return
     shutil.copytree(ready, folder / "whole")
     serve(folder / "whole", kind)
     with Catalog.open(folder / "whole") as catalog:
-        wanted = content(catalog, 2)
+        expected = content(catalog, 2)
     kill_at_every_step(
         *(folder, ((FILE_STEPS, file_stride), (FILE_STEPS | SQL_STEPS, stride))),
         lambda data_dir: shutil.copytree(ready, data_dir),
         lambda data_dir, tell: serve(data_dir, kind, tell),
-        lambda data_dir, told: check(data_dir, told, wanted),
+        lambda data_dir, report: check(data_dir, report, expected),
         threading.setprofile,  # jobs have a thread of their own; what the main thread does is the store's own test
     )
 

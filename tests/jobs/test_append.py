@@ -60,33 +60,35 @@ def test_old_images_stay_and_appended_places_are_found(first, run, catalog, eval
         Traverse.delete(catalog.data_dir, DOMAIN, name)  # what they hold is not read again
     result = run("more", append=True)
     assert (result["active"], result["metrics"]["n_map_images"]) == (True, 55)
-    before, after = contents(catalog, 1), contents(catalog, 2)
-    is_old = np.isin(after.position_m, np.arange(40.0))
+    old_map, new_map = contents(catalog, 1), contents(catalog, 2)
+    is_old = np.isin(new_map.position_m, np.arange(40.0))
     assert is_old.sum() == 40
-    assert (np.diff(after.position_m) >= 0).all()
-    assert np.array_equal(after.lists[:, is_old], before.lists)
-    assert np.array_equal(after.landmark_model["prototypes"], before.landmark_model["prototypes"])
+    assert (np.diff(new_map.position_m) >= 0).all()
+    assert np.array_equal(new_map.lists[:, is_old], old_map.lists)
+    assert np.array_equal(new_map.landmark_model["prototypes"], old_map.landmark_model["prototypes"])
     if relevance is Relevance.COMPOSED:
-        assert np.array_equal(after.landmark_model["usual"], after.usual_encoding)
-        both = np.concatenate([old, new]).astype(np.float64)
-        assert after.usual_encoding == pytest.approx(np.stack([both.mean(axis=0), both.std(axis=0)]), rel=1e-4)
-        assert not np.array_equal(after.usual_product, before.usual_product)
+        assert np.array_equal(new_map.landmark_model["usual"], new_map.usual_encoding)
+        encodings = np.concatenate([old, new]).astype(np.float64)
+        assert new_map.usual_encoding == pytest.approx(
+            np.stack([encodings.mean(axis=0), encodings.std(axis=0)]), rel=1e-4
+        )
+        assert not np.array_equal(new_map.usual_product, old_map.usual_product)
         assert "drive are not stored here" in result["metrics"]["fused"]["why"]
     for name in ("likelihood_scale", "novelty"):
-        assert np.array_equal(getattr(after, name), getattr(before, name))
+        assert np.array_equal(getattr(new_map, name), getattr(old_map, name))
     for name in ("values", "encodings"):
-        kept, has = getattr(before, name), getattr(after, name)
-        assert (kept is None) == (has is None)
+        old_array, new_array = getattr(old_map, name), getattr(new_map, name)
+        assert (old_array is None) == (new_array is None)
     if relevance is Relevance.SIMBAD:
-        assert np.array_equal(after.values[:, is_old], before.values)
+        assert np.array_equal(new_map.values[:, is_old], old_map.values)
     if relevance is Relevance.BRUTE_FORCE:
-        assert np.array_equal(after.encodings[is_old], old)
-        assert np.array_equal(after.encodings[~is_old], new)
+        assert np.array_equal(new_map.encodings[is_old], old)
+        assert np.array_equal(new_map.encodings[~is_old], new)
     snapshot = load_snapshot(catalog, DOMAIN, 2)
-    found = [
+    ranks = [
         rank(snapshot, evaluator, encoding, image) for encoding, image in zip(new, np.flatnonzero(~is_old), strict=True)
     ]
-    assert np.mean(found) < 3  # of 55 images
+    assert np.mean(ranks) < 3  # of 55 images
 
 
 def rank(snapshot, evaluator, encoding, image):
@@ -162,14 +164,14 @@ def test_a_map_knows_the_frames_it_is_made_of(first, run, catalog):
     old, new = first(training_episodes=0)
     run("more", append=True)
     assert contents(catalog, 1).frame_digest.tolist() == digests(old)
-    after = contents(catalog, 2)
-    is_old = np.isin(after.position_m, np.arange(40.0))
-    assert after.frame_digest[is_old].tolist() == digests(old)
-    assert after.frame_digest[~is_old].tolist() == digests(new)
-    assert after.frame_name[is_old].tolist() == [f"drive{i}.png" for i in range(40)]
-    assert after.frame_name[~is_old].tolist() == [f"more{i}.png" for i in range(15)]
-    assert (after.frame_drive == np.where(is_old, "drive", "more")).all()
-    assert after.landmark_digest.tolist() == contents(catalog, 1).landmark_digest.tolist(), "landmarks stay"
+    map_ = contents(catalog, 2)
+    is_old = np.isin(map_.position_m, np.arange(40.0))
+    assert map_.frame_digest[is_old].tolist() == digests(old)
+    assert map_.frame_digest[~is_old].tolist() == digests(new)
+    assert map_.frame_name[is_old].tolist() == [f"drive{i}.png" for i in range(40)]
+    assert map_.frame_name[~is_old].tolist() == [f"more{i}.png" for i in range(15)]
+    assert (map_.frame_drive == np.where(is_old, "drive", "more")).all()
+    assert map_.landmark_digest.tolist() == contents(catalog, 1).landmark_digest.tolist(), "landmarks stay"
 
 
 def test_digests_stay_as_they_are():
@@ -198,13 +200,13 @@ def test_a_loop_takes_the_frames_of_any_turn(catalog, evaluator, drive):
     catalog.delete_domain(DOMAIN)
     catalog.create_domain(DOMAIN, {"kind": "feature_l2", "extractor": "none"}, True, (1.0, 2.0))
     drive("drive", 40, seed=2)
-    given = {"landmark_traverse": "drive", "n_landmarks": 12, "training_episodes": 50}
-    remap(catalog, DOMAIN, RemapConfig("drive", **given), evaluator, Progress(REMAP_STAGES))
+    parameters = {"landmark_traverse": "drive", "n_landmarks": 12, "training_episodes": 50}
+    remap(catalog, DOMAIN, RemapConfig("drive", **parameters), evaluator, Progress(REMAP_STAGES))
     drive("lap", 30, seed=3, position_m=np.arange(30) + 30.5)  # past the start after 10 m
     remap(catalog, DOMAIN, RemapConfig("lap", append=True), evaluator, Progress(REMAP_STAGES))
-    after = contents(catalog, 2)
-    assert after.n_images == 70
-    assert after.position_m.max() == 39.5
+    map_ = contents(catalog, 2)
+    assert map_.n_images == 70
+    assert map_.position_m.max() == 39.5
     snapshot = load_snapshot(catalog, DOMAIN, 2)
     assert snapshot.route.length_m == pytest.approx(40.0, abs=0.51)
 
@@ -220,14 +222,16 @@ def season(catalog, request):
     d = request.param
     place = np.random.default_rng(0).normal(size=(PLACES + 20, d))
 
-    def store(name, seed, at=range(PLACES), weight=1.2):
+    def store(name, seed, places=range(PLACES), weight=1.2):
         rng = np.random.default_rng(seed)
-        seen = place[at] + weight * rng.normal(size=(len(at), d)) * (np.arange(d) % 4 == 0)  # a season changes these
-        encodings = (rng.normal(size=d) + rng.uniform(0.5, 2, d) * (seen + 0.2 * rng.normal(size=seen.shape))).astype(
-            np.float32
-        )
+        season_places = place[places] + weight * rng.normal(size=(len(places), d)) * (
+            np.arange(d) % 4 == 0
+        )  # a season changes these
+        encodings = (
+            rng.normal(size=d) + rng.uniform(0.5, 2, d) * (season_places + 0.2 * rng.normal(size=season_places.shape))
+        ).astype(np.float32)
         with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:
-            traverse.put_frames(Drive(position_m=np.array(at, float), encodings=encodings))
+            traverse.put_frames(Drive(position_m=np.array(places, float), encodings=encodings))
         return encodings
 
     return store
@@ -261,18 +265,18 @@ def test_places_seen_again_become_the_mean_of_their_seasons(season, run, catalog
     )
     third = run("spring", append=True)["metrics"]
     assert (third["n_map_images"], third["fused"]["accepted"], third["fused"]["n_new_images"]) == (PLACES + 18, True, 0)
-    one, two, three = (contents(catalog, version) for version in (1, 2, 3))
-    assert three.list_length == one.list_length
-    assert np.array_equal(three.frame_digest[:PLACES], one.frame_digest), "images stay"
-    assert three.q_values.shape == (PLACES + 18, 2)
-    assert three.landmark_model["prototypes"].shape == one.landmark_model["prototypes"].shape
-    moved = np.einsum("rk,rk->r", three.landmark_model["prototypes"], two.landmark_model["prototypes"])
-    assert moved.min() > 0.5, "landmarks move with the space, and towards what was seen"
-    assert np.array_equal(three.landmark_model["usual"], three.usual_encoding)
+    map_1, map_2, map_3 = (contents(catalog, version) for version in (1, 2, 3))
+    assert map_3.list_length == map_1.list_length
+    assert np.array_equal(map_3.frame_digest[:PLACES], map_1.frame_digest), "images stay"
+    assert map_3.q_values.shape == (PLACES + 18, 2)
+    assert map_3.landmark_model["prototypes"].shape == map_1.landmark_model["prototypes"].shape
+    nearness = np.einsum("rk,rk->r", map_3.landmark_model["prototypes"], map_2.landmark_model["prototypes"])
+    assert nearness.min() > 0.5, "landmarks move with the space, and towards what was seen"
+    assert np.array_equal(map_3.landmark_model["usual"], map_3.usual_encoding)
     run("summer", landmark_traverse="winter", n_landmarks=60, training_episodes=0, same_route=True)
-    found = [hits(map_, live) for map_ in (one, two, three, contents(catalog, 4))]
-    assert found[0] + 10 < found[1] < found[2]
-    assert found[1] > found[3] - 10
+    n_hits = [hits(map_, live) for map_ in (map_1, map_2, map_3, contents(catalog, 4))]
+    assert n_hits[0] + 10 < n_hits[1] < n_hits[2]
+    assert n_hits[1] > n_hits[3] - 10
 
 
 def test_a_season_that_a_map_knows_is_not_fused_into_it_again(season, run, catalog):
@@ -298,14 +302,14 @@ def test_a_drive_is_fused_only_where_its_views_agree(season, run, catalog):
     encodings = stored(catalog, "elsewhere").encodings
     with Traverse.create(catalog.data_dir, DOMAIN, "shuffled") as traverse:
         traverse.put_frames(Drive(position_m=np.arange(PLACES) + 0.25, encodings=encodings))
-    added = run("shuffled", append=True)["metrics"]
-    assert (added["fused"]["accepted"], added["n_map_images"]) == (False, 2 * PLACES)
-    assert "agree no better" in added["fused"]["why"]
+    metrics = run("shuffled", append=True)["metrics"]
+    assert (metrics["fused"]["accepted"], metrics["n_map_images"]) == (False, 2 * PLACES)
+    assert "agree no better" in metrics["fused"]["why"]
     again = run("later", append=True)["metrics"]
     assert (again["fused"]["accepted"], again["n_map_images"]) == (True, 2 * PLACES), "with the images that agree"
     catalog.activate(DOMAIN, 1, 3)
-    said = run("later", append=True, same_route=False)["metrics"]["fused"]
-    assert (said["accepted"], "said not to share" in said["why"]) == (False, True)
+    verdict = run("later", append=True, same_route=False)["metrics"]["fused"]
+    assert (verdict["accepted"], "said not to share" in verdict["why"]) == (False, True)
 
 
 def test_a_fused_frame_does_not_find_itself_when_the_map_is_checked(season, run, catalog):
@@ -315,20 +319,20 @@ def test_a_fused_frame_does_not_find_itself_when_the_map_is_checked(season, run,
     run("summer", n_landmarks=60, training_episodes=0)
     held_out = run("winter", append=True)["metrics"]["check"]
     assert (held_out["n_queries"], held_out["anr"] < held_out["anr_active"]) == (PLACES // 10, True)
-    before, after = contents(catalog, 1), contents(catalog, 2)
+    old_map, new_map = contents(catalog, 1), contents(catalog, 2)
     summer, winter = (stored(catalog, name) for name in ("summer", "winter"))
-    fused, _ = fuse(before, KnownDrives.of(before, [(summer, True)], summer), winter, None)
-    assert np.array_equal(fused.map.lists, after.lists)
-    asked = np.arange(0, PLACES, 10)
-    assert np.array_equal(fused.without(asked[:0]).lists, after.lists)
+    fused, _ = fuse(old_map, KnownDrives.of(old_map, [(summer, True)], summer), winter, None)
+    assert np.array_equal(fused.map.lists, new_map.lists)
+    frames = np.arange(0, PLACES, 10)
+    assert np.array_equal(fused.without(frames[:0]).lists, new_map.lists)
 
     def nearness(map_):
-        """Of the frames that are asked for to the sums that stand for their places."""
+        """The mean cosine between the frames' units and the sums that stand for their places."""
         landmarks, weights = map_.landmark_model["prototypes"], list_weights(map_.list_length)
-        sums = unit(np.tensordot(weights, landmarks[map_.lists[:, asked]], axes=1))
-        return (sums * fused.u[asked]).sum(axis=1).mean()
+        sums = unit(np.tensordot(weights, landmarks[map_.lists[:, frames]], axes=1))
+        return (sums * fused.u[frames]).sum(axis=1).mean()
 
-    assert nearness(fused.without(asked)) < nearness(after) - 0.02
+    assert nearness(fused.without(frames)) < nearness(new_map) - 0.02
     of_itself = run("spring", append=True, check_traverse="winter")["metrics"]["check"]
     assert (of_itself["anr"], "made of the frames of traverse winter itself" in of_itself["why"]) == (None, True)
 
@@ -339,8 +343,8 @@ def test_what_was_deleted_or_changed_cannot_be_fused(season, run, catalog):
     run("summer", n_landmarks=60, training_episodes=0)
     Traverse.delete(catalog.data_dir, DOMAIN, "summer")
     season("summer", 7)
-    added = run("winter", append=True)["metrics"]
-    assert (added["n_map_images"], added["fused"]["why"]) == (
+    metrics = run("winter", append=True)["metrics"]
+    assert (metrics["n_map_images"], metrics["fused"]["why"]) == (
         2 * PLACES,
         "the drives that the map is made of hold other frames by now",
     )

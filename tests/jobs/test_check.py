@@ -56,8 +56,8 @@ def store(catalog):
 @pytest.fixture
 def remapped(catalog, evaluator):
     def run(**config):
-        given = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 0} | config
-        return remap(catalog, DOMAIN, RemapConfig(**given), evaluator, Progress(REMAP_STAGES))
+        parameters = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 0} | config
+        return remap(catalog, DOMAIN, RemapConfig(**parameters), evaluator, Progress(REMAP_STAGES))
 
     return run
 
@@ -151,8 +151,8 @@ def test_frames_do_not_find_what_the_map_has_of_them_under_another_name(store, r
     store("noise", noise[:300])
     remapped(training_traverse="noise", relevance=Relevance.BRUTE_FORCE)
     store("longer", noise)
-    given = {"landmark_traverse": None, "append": True, "relevance": Relevance.BRUTE_FORCE, "gate_margin": 0.0}
-    check = remapped(training_traverse="longer", n_landmarks=None, **given)["metrics"]["check"]
+    parameters = {"landmark_traverse": None, "append": True, "relevance": Relevance.BRUTE_FORCE, "gate_margin": 0.0}
+    check = remapped(training_traverse="longer", n_landmarks=None, **parameters)["metrics"]["check"]
     assert check["frames"] == "held_out"
     assert check["anr"] > 8, "0 would say that every frame found itself"
     assert check["anr_active"] > 8
@@ -165,9 +165,9 @@ def test_a_check_traverse_that_both_maps_have_among_others_is_asked_of_the_other
     store("other", np.random.default_rng(1).normal(size=(100, DIM)))
     store("third", np.random.default_rng(2).normal(size=(100, DIM)))
     remapped(training_traverse="other", relevance=Relevance.BRUTE_FORCE)
-    given = {"landmark_traverse": None, "append": True, "n_landmarks": None, "relevance": Relevance.BRUTE_FORCE}
-    remapped(training_traverse="noise", **given)
-    check = remapped(training_traverse="third", check_traverse="noise", **given)["metrics"]["check"]
+    parameters = {"landmark_traverse": None, "append": True, "n_landmarks": None, "relevance": Relevance.BRUTE_FORCE}
+    remapped(training_traverse="noise", **parameters)
+    check = remapped(training_traverse="third", check_traverse="noise", **parameters)["metrics"]["check"]
     assert (check["frames"], check["n_queries"], check["active_version"]) == ("traverse", 100, 2)
     assert check["anr"] > 4, "of the best of nine neighbours"
     assert check["anr_active"] > 4
@@ -365,14 +365,14 @@ def test_a_gate_that_compared_with_another_map_does_not_open(seasons, catalog, e
 
 
 def remap_while(catalog, evaluator, stage, meanwhile, gate_margin, check=None):
-    done = []
+    results = []
 
     def at(state):
-        if state.stage == stage and not done:
-            done.append(meanwhile())
+        if state.stage == stage and not results:
+            results.append(meanwhile())
 
-    given = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 10}
-    config = RemapConfig("day", check_traverse=check, gate_margin=gate_margin, **given)
+    parameters = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 10}
+    config = RemapConfig("day", check_traverse=check, gate_margin=gate_margin, **parameters)
     result = remap(catalog, DOMAIN, config, evaluator, Progress(REMAP_STAGES, at))
-    assert done
+    assert results
     return result

@@ -57,7 +57,7 @@ def add(catalog, domain, **changes):
 
 
 @pytest.fixture
-def there(tmp_path):
+def exporter(tmp_path):
     """A server whose domain has two maps, the second active."""
     with Catalog.open(tmp_path / "there") as catalog:
         catalog.create_domain("campus", EVALUATOR, False, ACTIONS_M)
@@ -67,46 +67,46 @@ def there(tmp_path):
 
 
 @pytest.fixture
-def here(tmp_path):
+def importer(tmp_path):
     """A server with nothing on it."""
     with Catalog.open(tmp_path / "here") as catalog:
         yield catalog
 
 
 @pytest.fixture
-def exported(there, tmp_path):
-    export_map(there, "campus", None, tmp_path / "campus.map")
+def exported(exporter, tmp_path):
+    export_map(exporter, "campus", None, tmp_path / "campus.map")
     return tmp_path / "campus.map"
 
 
-def test_the_bytes_travel_unchanged(there, here, tmp_path):
+def test_the_bytes_travel_unchanged(exporter, importer, tmp_path):
     file = tmp_path / "first.map"
-    sent = export_map(there, "campus", 1, file)
-    assert file.read_bytes() == there.map_path("campus", 1).read_bytes()
-    got = import_map(here, file, "garden", f"sha256:{sent.sha256.upper()}")
+    sent_record = export_map(exporter, "campus", 1, file)
+    assert file.read_bytes() == exporter.map_path("campus", 1).read_bytes()
+    got = import_map(importer, file, "garden", f"sha256:{sent_record.sha256.upper()}")
     assert (got.domain, got.map_version, got.active, got.domain_is_new) == ("garden", 1, True, True)
-    assert here.map_path("garden", 1).read_bytes() == file.read_bytes()
-    record = here.map("garden", 1)
-    assert (record.sha256, record.state, record.metrics["anr"]) == (sent.sha256, MapState.ACTIVE, 4.5)
-    assert record.config["imported"] == {"domain": "campus", "version": 1, "sha256": sent.sha256}
+    assert importer.map_path("garden", 1).read_bytes() == file.read_bytes()
+    record = importer.map("garden", 1)
+    assert (record.sha256, record.state, record.metrics["anr"]) == (sent_record.sha256, MapState.ACTIVE, 4.5)
+    assert record.config["imported"] == {"domain": "campus", "version": 1, "sha256": sent_record.sha256}
     assert record.config["training_traverse"] is None, "a traverse of that name here is another drive"
-    snapshot = Maps(here).active("garden").snapshot
+    snapshot = Maps(importer).active("garden").snapshot
     assert (snapshot.domain, snapshot.version, snapshot.n_images) == ("garden", 1, 30)
 
 
-def test_the_active_version_and_the_old_name_unless_told(exported, here):
-    assert import_map(here, exported).domain == "campus"
-    again = import_map(here, exported, activate=False)
+def test_the_active_version_and_the_old_name_unless_told(exported, importer):
+    assert import_map(importer, exported).domain == "campus"
+    again = import_map(importer, exported, activate=False)
     assert (again.map_version, again.active, again.domain_is_new) == (2, False, False)
-    assert here.domain("campus").active_version == 1
-    assert here.map("campus", 2).state is MapState.SEALED
-    assert here.map("campus", 1).config["imported"]["version"] == 2
+    assert importer.domain("campus").active_version == 1
+    assert importer.map("campus", 2).state is MapState.SEALED
+    assert importer.map("campus", 1).config["imported"]["version"] == 2
 
 
-def test_an_export_is_refused_by_name(there, tmp_path):
-    there.create_domain("empty", {}, False, [1])
-    building = there.begin_map("campus", {})
-    there.remove_map("campus", 1, lambda: False)
+def test_an_export_is_refused_by_name(exporter, tmp_path):
+    exporter.create_domain("empty", {}, False, [1])
+    building = exporter.begin_map("campus", {})
+    exporter.remove_map("campus", 1, lambda: False)
     for domain, version, error in (
         ("empty", None, NoActiveMapError),
         ("campus", 9, UnknownMapVersionError),
@@ -114,20 +114,20 @@ def test_an_export_is_refused_by_name(there, tmp_path):
         ("campus", 1, RetiredMapError),
     ):
         with pytest.raises(error):
-            export_map(there, domain, version, tmp_path / "x")
+            export_map(exporter, domain, version, tmp_path / "x")
     with pytest.raises(InvalidInputError, match="no folder"):
-        export_map(there, "campus", 2, tmp_path / "no" / "x")
+        export_map(exporter, "campus", 2, tmp_path / "no" / "x")
     (tmp_path / "mine").write_text("precious")
     with pytest.raises(ConflictError, match="never replaces"):
-        export_map(there, "campus", 2, tmp_path / "mine")
-    path = there.map_path("campus", 2)
+        export_map(exporter, "campus", 2, tmp_path / "mine")
+    path = exporter.map_path("campus", 2)
     path.chmod(0o644)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     with pytest.raises(DamagedMapError, match="map 2 of domain campus is damaged"):
-        export_map(there, "campus", 2, tmp_path / "x")
+        export_map(exporter, "campus", 2, tmp_path / "x")
     path.unlink()
     with pytest.raises(DamagedMapError, match="missing"):
-        export_map(there, "campus", 2, tmp_path / "x")
+        export_map(exporter, "campus", 2, tmp_path / "x")
     assert not (tmp_path / "x").exists()
     assert (tmp_path / "mine").read_text() == "precious"
 
@@ -140,64 +140,64 @@ def test_an_export_is_refused_by_name(there, tmp_path):
         (EVALUATOR, False, (1.0, 3.0)),
     ],
 )
-def test_a_domain_that_differs_is_left_alone(exported, here, parts):
-    here.create_domain("other", *parts)
+def test_a_domain_that_differs_is_left_alone(exported, importer, parts):
+    importer.create_domain("other", *parts)
     with pytest.raises(DomainDiffersError):
-        import_map(here, exported, "other")
-    assert here.maps("other") == []
+        import_map(importer, exported, "other")
+    assert importer.maps("other") == []
 
 
-def test_every_flipped_byte_that_matters_is_refused(exported, here, tmp_path):
+def test_every_flipped_byte_that_matters_is_refused(exported, importer, tmp_path):
     """With the digest every byte matters; without it what the file's own checksum covers does."""
-    whole = exported.read_bytes()
-    digest = hashlib.sha256(whole).hexdigest()
+    map_bytes = exported.read_bytes()
+    digest = hashlib.sha256(map_bytes).hexdigest()
     bad = tmp_path / "bad.map"
     rng = np.random.default_rng(0)
-    kept = contents("campus", 2)
-    for at in rng.integers(0, len(whole), 30).tolist():
-        bad.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << rng.integers(8))]) + whole[at + 1 :])
+    map_ = contents("campus", 2)
+    for at in rng.integers(0, len(map_bytes), 30).tolist():
+        bad.write_bytes(map_bytes[:at] + bytes([map_bytes[at] ^ (1 << rng.integers(8))]) + map_bytes[at + 1 :])
         with pytest.raises(InvalidArchiveError, match="another file"):
-            import_map(here, bad, sha256=digest)
-    places = [whole.index(kept.position_m[10:20].tobytes()) + 11, whole.index(b"feature_l2") + 3, 3]
+            import_map(importer, bad, sha256=digest)
+    places = [map_bytes.index(map_.position_m[10:20].tobytes()) + 11, map_bytes.index(b"feature_l2") + 3, 3]
     for at in places:
-        bad.write_bytes(whole[:at] + bytes([whole[at] ^ 2]) + whole[at + 1 :])
+        bad.write_bytes(map_bytes[:at] + bytes([map_bytes[at] ^ 2]) + map_bytes[at + 1 :])
         with pytest.raises(InvalidArchiveError, match="no map that can serve here"):
-            import_map(here, bad)
-    for content in (b"", b"no map at all" * 400, whole[: len(whole) // 2]):
+            import_map(importer, bad)
+    for content in (b"", b"no map at all" * 400, map_bytes[: len(map_bytes) // 2]):
         bad.write_bytes(content)
         with pytest.raises(InvalidArchiveError):
-            import_map(here, bad)
+            import_map(importer, bad)
     with pytest.raises(InvalidArchiveError, match="cannot be read"):
-        import_map(here, tmp_path / "gone")
+        import_map(importer, tmp_path / "gone")
     with pytest.raises(InvalidArchiveError, match="cannot be read"):
-        import_map(here, tmp_path)
-    assert here.domains() == []
+        import_map(importer, tmp_path)
+    assert importer.domains() == []
 
 
-def test_a_map_of_an_evaluator_that_is_not_here_is_refused(there, here, tmp_path):
-    there.create_domain("new", {"kind": "telepathy"}, False, ACTIONS_M)
-    add(there, "new", evaluator={"kind": "telepathy"})
-    export_map(there, "new", None, tmp_path / "new.map")
+def test_a_map_of_an_evaluator_that_is_not_here_is_refused(exporter, importer, tmp_path):
+    exporter.create_domain("new", {"kind": "telepathy"}, False, ACTIONS_M)
+    add(exporter, "new", evaluator={"kind": "telepathy"})
+    export_map(exporter, "new", None, tmp_path / "new.map")
     with pytest.raises(InvalidArchiveError, match="no kind of evaluator"):
-        import_map(here, tmp_path / "new.map")
-    export_map(there, "campus", None, tmp_path / "campus.map")
+        import_map(importer, tmp_path / "new.map")
+    export_map(exporter, "campus", None, tmp_path / "campus.map")
     with pytest.raises(InvalidInputError, match="a domain is named by"):
-        import_map(here, tmp_path / "campus.map", "../elsewhere")
-    assert here.domains() == []
+        import_map(importer, tmp_path / "campus.map", "../elsewhere")
+    assert importer.domains() == []
 
 
 @pytest.mark.parametrize("is_used", [False, True])
-def test_an_import_that_fails_leaves_what_others_began_in_its_domain(exported, here, monkeypatch, is_used):
+def test_an_import_that_fails_leaves_what_others_began_in_its_domain(exported, importer, monkeypatch, is_used):
     def fail(*_):
         if is_used:
-            Traverse.create(here.data_dir, "campus", "mine").close()
+            Traverse.create(importer.data_dir, "campus", "mine").close()
         raise UnavailableError("no space is left")
 
     monkeypatch.setattr("deepsimbad.jobs.versions.adopt", fail)
     with pytest.raises(UnavailableError):
-        import_map(here, exported)
-    assert [record.name for record in here.domains()] == (["campus"] if is_used else [])
-    assert Traverse.list(here.data_dir, "campus") == (["mine"] if is_used else [])
+        import_map(importer, exported)
+    assert [record.name for record in importer.domains()] == (["campus"] if is_used else [])
+    assert Traverse.list(importer.data_dir, "campus") == (["mine"] if is_used else [])
 
 
 @pytest.mark.parametrize(
@@ -210,13 +210,13 @@ def test_an_import_that_fails_leaves_what_others_began_in_its_domain(exported, h
         {"position_m": np.full(30, 5.0)},  # as all that tests/core/test_map.py lists
     ],
 )
-def test_a_map_that_could_answer_nothing_is_refused(here, tmp_path, changes):
+def test_a_map_that_could_answer_nothing_is_refused(importer, tmp_path, changes):
     """A file with a right digest may still be one that no release wrote."""
     write_map(tmp_path / "building", contents("campus", 1, **changes))
     seal(tmp_path / "building", tmp_path / "crafted.sqlite")
     with pytest.raises(InvalidArchiveError, match="no map that can serve here"):
-        import_map(here, tmp_path / "crafted.sqlite")
-    assert here.domains() == []
+        import_map(importer, tmp_path / "crafted.sqlite")
+    assert importer.domains() == []
 
 
 @pytest.mark.parametrize(
@@ -227,9 +227,9 @@ def test_a_map_that_could_answer_nothing_is_refused(here, tmp_path, changes):
         "CREATE VIRTUAL TABLE texts USING fts5(body)",
     ],
 )
-def test_a_map_whose_schema_would_run_something_is_refused(exported, here, statement):
+def test_a_map_whose_schema_would_run_something_is_refused(exported, importer, statement):
     with closing(sqlite3.connect(exported)) as db:
         db.execute(statement)
     with pytest.raises(InvalidArchiveError, match="what no release writes"):
-        import_map(here, exported)
-    assert here.domains() == []
+        import_map(importer, exported)
+    assert importer.domains() == []

@@ -40,7 +40,7 @@ def never():
     return False
 
 
-def nothing(state):
+def ignore(state):
     return None
 
 
@@ -52,30 +52,32 @@ def job(catalog, drive):
 
 
 def test_the_map_is_the_one_that_this_process_would_make(catalog, job, caplog):
-    seen = []
+    states = []
     with caplog.at_level(logging.INFO, "deepsimbad"):
-        result = InAnotherProcess(catalog.data_dir, 1)(job, seen.append, never)
+        result = InAnotherProcess(catalog.data_dir, 1)(job, states.append, never)
     assert result["map_version"] == 1
     assert result["metrics"] == catalog.map(DOMAIN, 1).metrics
-    assert (seen[0].stage, seen[-1].stage) == ("read frames", "activate")
+    assert (states[0].stage, states[-1].stage) == ("read frames", "activate")
     other = catalog.start_job(catalog.create_job(DOMAIN, REMAP, CONFIG.as_dict()).job_id)
-    InThisProcess(catalog.data_dir)(other, nothing, never)
-    here, there = (asdict(replace(read_map(catalog.map_path(DOMAIN, v)), version=0, created_at="")) for v in (1, 2))
-    assert here.keys() == there.keys()
-    for name in here:
-        np.testing.assert_equal(here[name], there[name], name)
+    InThisProcess(catalog.data_dir)(other, ignore, never)
+    child_map, own_map = (
+        asdict(replace(read_map(catalog.map_path(DOMAIN, v)), version=0, created_at="")) for v in (1, 2)
+    )
+    assert child_map.keys() == own_map.keys()
+    for name in child_map:
+        np.testing.assert_equal(child_map[name], own_map[name], name)
 
 
 def test_errors_come_back_by_name_with_what_helps(catalog, job):
     failing = replace(job, config={**job.config, "n_landmarks": 61})
     with pytest.raises(TooFewCandidatesError, match="60 candidates for 61") as raised:
-        InAnotherProcess(catalog.data_dir, 1)(failing, nothing, never)
+        InAnotherProcess(catalog.data_dir, 1)(failing, ignore, never)
     assert raised.value.hints == {"n_candidates": 60, "n_landmarks": 61}
 
 
 def test_what_breaks_has_its_stack_in_the_notes_alone(catalog, job):
     with pytest.raises(BrokenJobError) as raised:
-        InAnotherProcess(catalog.data_dir, 1)(replace(job, config={"levitate": True}), nothing, never)
+        InAnotherProcess(catalog.data_dir, 1)(replace(job, config={"levitate": True}), ignore, never)
     assert "levitate" not in str(raised.value)
     assert "Traceback" in raised.value.__notes__[0]
 
@@ -83,16 +85,22 @@ def test_what_breaks_has_its_stack_in_the_notes_alone(catalog, job):
 def test_its_log_lines_are_the_services_with_the_jobs_id(monkeypatch, caplog):
     messages = []
     monkeypatch.setattr(child, "_tell", lambda **message: messages.append(json.loads(json.dumps(message))))
-    told = {"name": "deepsimbad.store", "levelno": logging.WARNING, "msg": "%s rots", "args": ("it",), "file": "f"}
-    child._LogToParent().emit(logging.makeLogRecord(told))
+    attributes = {
+        "name": "deepsimbad.store",
+        "levelno": logging.WARNING,
+        "msg": "%s rots",
+        "args": ("it",),
+        "file": "f",
+    }
+    child._LogToParent().emit(logging.makeLogRecord(attributes))
     runner._log_here(messages[0]["log"], "j")
     record = caplog.records[-1]
     assert (record.name, record.levelname, record.getMessage()) == ("deepsimbad.store", "WARNING", "it rots")
     assert (record.__dict__["job_id"], record.__dict__["file"]) == ("j", "f")
 
 
-def about(pid, what):
-    return Path("/proc", str(pid), what)
+def proc_file(pid, name):
+    return Path("/proc", str(pid), name)
 
 
 class Doing:
@@ -104,29 +112,29 @@ class Doing:
         self._caplog = caplog
         self._thread = threading.Thread(target=self._run, args=[job])
         self._thread.start()
-        self.pid = self._until(self._begun)
+        self.pid = self._wait_for(self._pid)
 
     def _run(self, job):
         try:
-            self.ending = self._run_job(job, nothing, self.cancelled.is_set)
+            self.ending = self._run_job(job, ignore, self.cancelled.is_set)
         except DeepSimbadError as error:
             self.ending = error
 
-    def _begun(self):
+    def _pid(self):
         return next((record.__dict__["pid"] for record in self._caplog.records if "pid" in record.__dict__), None)
 
-    def _until(self, answer):
+    def _wait_for(self, answer):
         give_up = time.monotonic() + WITHIN_S
-        while not (found := answer()):
+        while not (value := answer()):
             assert time.monotonic() < give_up
             time.sleep(0.01)
-        return found
+        return value
 
     def until_ready(self):
         """Until it yields to everyone and listens: its listening thread is there."""
-        self._until(lambda: len(list(about(self.pid, "task").iterdir())) > 1)
+        self._wait_for(lambda: len(list(proc_file(self.pid, "task").iterdir())) > 1)
 
-    def ended(self):
+    def end(self):
         self._thread.join(WITHIN_S)
         assert not self._thread.is_alive()
         return self.ending
@@ -142,7 +150,7 @@ def no_map_begins(catalog):
 
 
 @contextmanager
-def held(catalog, job, caplog, run_job=None):
+def running(catalog, job, caplog, run_job=None):
     with caplog.at_level(logging.INFO, "deepsimbad"):
         with no_map_begins(catalog):
             doing = Doing(catalog, job, caplog, run_job)
@@ -150,7 +158,7 @@ def held(catalog, job, caplog, run_job=None):
                 yield doing
             finally:
                 doing.cancelled.set()
-        doing.ended()
+        doing.end()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
@@ -159,55 +167,55 @@ def held(catalog, job, caplog, run_job=None):
 )
 def test_it_yields_as_far_as_it_is_told_and_computes_in_the_threads_it_is_given(catalog, job, caplog, priority, kind):
     nice = os.getpriority(os.PRIO_PROCESS, 0) if priority == "normal" else 19
-    with held(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, JobPriority(priority))) as doing:
+    with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, JobPriority(priority))) as doing:
         doing.until_ready()
-        for task in about(doing.pid, "task").iterdir():
+        for task in proc_file(doing.pid, "task").iterdir():
             assert os.sched_getscheduler(int(task.name)) == getattr(os, kind), "every thread of it"
             assert os.getpriority(os.PRIO_PROCESS, int(task.name)) == nice
-        assert int(about(doing.pid, "oom_score_adj").read_text(encoding="ascii")) >= 500
-        environment = about(doing.pid, "environ").read_text(encoding="utf-8").split("\0")
+        assert int(proc_file(doing.pid, "oom_score_adj").read_text(encoding="ascii")) >= 500
+        environment = proc_file(doing.pid, "environ").read_text(encoding="utf-8").split("\0")
         for library in ("NUMBA", "OMP", "OPENBLAS"):
             assert f"{library}_NUM_THREADS=3" in environment
 
 
 def test_a_cancel_is_heard(catalog, job, caplog):
-    with held(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, stops_within_s=WITHIN_S)) as doing:
+    with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, stops_within_s=WITHIN_S)) as doing:
         doing.cancelled.set()
-        error = doing.ended()
+        error = doing.end()
     assert isinstance(error, CancelledError)
     assert "killed" not in error.message
     assert catalog.maps(DOMAIN) == []
 
 
 def test_a_cancel_is_enforced(catalog, job, caplog):
-    with held(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 1, stops_within_s=0.2)) as doing:
+    with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 1, stops_within_s=0.2)) as doing:
         os.kill(doing.pid, signal.SIGSTOP)
         doing.cancelled.set()
-        error = doing.ended()
+        error = doing.end()
     assert isinstance(error, CancelledError)
     assert "killed" in error.message
 
 
 @pytest.mark.parametrize(
-    ("sent", "said"), [(signal.SIGKILL, "where memory runs out"), (signal.SIGSEGV, "ended by SIGSEGV")]
+    ("signal_number", "message"), [(signal.SIGKILL, "where memory runs out"), (signal.SIGSEGV, "ended by SIGSEGV")]
 )
-def test_a_death_names_its_signal(catalog, job, caplog, sent, said):
-    with held(catalog, job, caplog) as doing:
+def test_a_death_names_its_signal(catalog, job, caplog, signal_number, message):
+    with running(catalog, job, caplog) as doing:
         doing.until_ready()
-        os.kill(doing.pid, sent)
-        error = doing.ended()
+        os.kill(doing.pid, signal_number)
+        error = doing.end()
     words = [record.__dict__["line"] for record in caplog.records if record.getMessage() == "the job's process said"]
-    assert any("Fatal Python error" in line for line in words) == (sent is signal.SIGSEGV)
+    assert any("Fatal Python error" in line for line in words) == (signal_number is signal.SIGSEGV)
     assert isinstance(error, JobInterruptedError)
-    assert said in error.message
-    assert error.hints == {"signal": sent.name}
+    assert message in error.message
+    assert error.hints == {"signal": signal_number.name}
 
 
 def test_what_stops_the_service_does_not_stop_its_job_first(catalog, job, caplog):
-    with held(catalog, job, caplog) as doing:
+    with running(catalog, job, caplog) as doing:
         doing.until_ready()
-        for sent in (signal.SIGINT, signal.SIGTERM):
-            os.kill(doing.pid, sent)
+        for signal_number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(doing.pid, signal_number)
         time.sleep(0.2)
         os.kill(doing.pid, 0)
         assert doing.ending is None
@@ -262,7 +270,7 @@ def test_killed_together_with_its_parent(catalog, job):
 
 def is_running(pid):
     try:
-        return about(pid, "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+        return proc_file(pid, "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
 
@@ -270,4 +278,4 @@ def is_running(pid):
 def test_where_no_process_can_be_started_the_job_fails_by_name(catalog, job, monkeypatch):
     monkeypatch.setattr(sys, "executable", str(catalog.data_dir / "nothing"))
     with pytest.raises(UnavailableError, match="no process could be started"):
-        InAnotherProcess(catalog.data_dir, 1)(job, nothing, never)
+        InAnotherProcess(catalog.data_dir, 1)(job, ignore, never)

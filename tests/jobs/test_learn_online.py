@@ -26,14 +26,14 @@ def walk(catalog, drive, evaluator, quiet):
     model = read_map(catalog.map_path(DOMAIN, 1)).landmark_model
     frames = np.arange(3, 33, 2)
     ranks = rank_landmarks(evaluator.dissimilarities(encodings[frames], model))
-    return KnownWalk([Query(each) for each in ranks], np.full(frames.size, 2.0), frames.astype(float))
+    return KnownWalk([Query(row) for row in ranks], np.full(frames.size, 2.0), frames.astype(float))
 
 
 def test_a_cancel_leaves_nothing(catalog, walk):
     with pytest.raises(CancelledError):
         learn_online(catalog, DOMAIN, [walk], Progress(LEARN_STAGES, is_cancelled=lambda: True))
-    asked = iter([False, False, False, True])
+    answers = iter([False, False, False, True])
     with pytest.raises(CancelledError):
-        learn_online(catalog, DOMAIN, [walk], Progress(LEARN_STAGES, is_cancelled=lambda: next(asked)))
-    assert [each.version for each in catalog.maps(DOMAIN)] == [1]
+        learn_online(catalog, DOMAIN, [walk], Progress(LEARN_STAGES, is_cancelled=lambda: next(answers)))
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1]
     assert catalog.domain(DOMAIN).active_version == 1

@@ -64,10 +64,10 @@ def test_the_readers_own_count_is_kept(folder, judge):
 def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, judge, tmp_path_factory):
     cv2.imwrite(str(folder / "4.png"), np.zeros((90, 160, 3), np.uint8))
     recording, out = open_source(str(folder)), tmp_path_factory.mktemp("out")
-    with open_encoding_cache(out, "queries", source=str(folder)) as kept:
-        first = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=kept)
-    with open_encoding_cache(out, "queries", source=str(folder)) as kept:
-        again = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=kept)
+    with open_encoding_cache(out, "queries", source=str(folder)) as cache:
+        first = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=cache)
+    with open_encoding_cache(out, "queries", source=str(folder)) as cache:
+        again = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=cache)
     assert again.encode_ms is None, "nothing was encoded"
     assert again.drive.shows_nothing.tolist() == [False, False, False, True, False]
     assert first.drive.shows_nothing.tolist() == again.drive.shows_nothing.tolist()
@@ -76,19 +76,19 @@ def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, jud
 def test_a_run_that_is_killed_has_kept_what_it_encoded_now_and_then(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_module, "_LEAST_NEW", 3)
     on_disk = []
-    with open_encoding_cache(tmp_path, "queries", source="drive") as kept:
+    with open_encoding_cache(tmp_path, "queries", source="drive") as cache:
         for frame in range(17):
-            kept[str(frame)] = np.full(4, frame, np.float32), False
-            with open_encoding_cache(tmp_path, "queries", source="drive") as again:
-                on_disk.append(len(again))
+            cache[str(frame)] = np.full(4, frame, np.float32), False
+            with open_encoding_cache(tmp_path, "queries", source="drive") as second_cache:
+                on_disk.append(len(second_cache))
     assert on_disk == [0, 0, *[3] * 3, *[6] * 3, *[9] * 3, *[12] * 3, *[15] * 3]
     monkeypatch.setattr(cache_module, "_NEW_SHARE", 1)
-    with open_encoding_cache(tmp_path, "queries", source="drive") as kept:
-        assert len(kept) == 17
+    with open_encoding_cache(tmp_path, "queries", source="drive") as cache:
+        assert len(cache) == 17
         for frame in range(17, 34):
-            kept[str(frame)] = np.full(4, frame, np.float32), False
-            with open_encoding_cache(tmp_path, "queries", source="drive") as again:
-                assert len(again) == (34 if frame == 33 else 17), "twice as many before they are written anew"
+            cache[str(frame)] = np.full(4, frame, np.float32), False
+            with open_encoding_cache(tmp_path, "queries", source="drive") as second_cache:
+                assert len(second_cache) == (34 if frame == 33 else 17), "twice as many before they are written anew"
 
 
 def test_a_recording_of_broken_frames_alone_is_named(folder, judge):
@@ -119,7 +119,7 @@ def test_ready_encodings_are_taken_as_they_are(tmp_path, judge):
     assert encoded.drive.route().x_m is None
 
 
-def placed(*positions_m):
+def recording_at(*positions_m):
     """A recording that knows the ground coordinates of some frames."""
     frames = tuple(
         Frame(i, str(i), at, timestamp_us=i, x_m=None if i == 1 else 1.0 * i, y_m=2.0)
@@ -129,7 +129,7 @@ def placed(*positions_m):
 
 
 def test_ground_coordinates_and_times_are_kept(judge):
-    encoded = encode_recording(placed(0, 1, 2), judge, MAX_PIXELS, lambda _: None)
+    encoded = encode_recording(recording_at(0, 1, 2), judge, MAX_PIXELS, lambda _: None)
     assert encoded.drive.timestamp_us.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(encoded.drive.route().x_m, [0.0, np.nan, 2.0])
     np.testing.assert_array_equal(encoded.drive.route().y_m, [2.0, 2.0, 2.0])
@@ -137,7 +137,7 @@ def test_ground_coordinates_and_times_are_kept(judge):
 
 def test_positions_that_go_backwards_are_named(judge):
     with pytest.raises(InvalidRouteError, match="frame 2"):
-        encode_recording(placed(0, 2, 1), judge, MAX_PIXELS, lambda _: None)
+        encode_recording(recording_at(0, 2, 1), judge, MAX_PIXELS, lambda _: None)
 
 
 # --- ground truth --------------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def test_every_form_of_ground_truth(tmp_path, array, test_index, training_index,
 
 def test_a_frame_that_is_told_wrongly_is_named(folder):
     objects = {"0.png": [], "1.png": [{"label": "car", "box": [10, 20, 100, 200]}]}
-    lines = (json.dumps({"name": name, "objects": told}) for name, told in objects.items())
+    lines = (json.dumps({"name": name, "objects": scene}) for name, scene in objects.items())
     (folder / "detections.jsonl").write_text("\n".join(lines))
     recording = as_taken(open_source(str(folder)), {"objects"})
     with pytest.raises(InvalidSceneError, match=r"^1\.png: object 0: a box is"):

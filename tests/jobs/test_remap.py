@@ -47,8 +47,8 @@ def test_a_map_is_sealed_active_and_holds_the_lists_of_its_landmarks(catalog, dr
     verify(catalog.map_path(DOMAIN, 1), record.sha256)
     contents = read_map(catalog.map_path(DOMAIN, 1))
     prototypes = contents.landmark_model["prototypes"]
-    began = [int(name.removeprefix("other").removesuffix(".png")) for name in contents.landmark_frame]
-    assert (prototypes == candidates[began]).all()
+    candidate_rows = [int(name.removeprefix("other").removesuffix(".png")) for name in contents.landmark_frame]
+    assert (prototypes == candidates[candidate_rows]).all()
     assert contents.landmark_drive.tolist() == 8 * ["other"]
     for image, encoding in enumerate(encodings):
         assert contents.lists[:, image].tolist() == nearest_first(encoding, prototypes)[:4]
@@ -100,7 +100,7 @@ def test_cancelled_at_any_stage_it_leaves_nothing_behind(catalog, drive, evaluat
     drive("other", 30, seed=1)
     drive("drive", 5)
     at = []
-    progress = Progress(REMAP_STAGES, lambda state: at.append(state.stage), lambda: at[-1:] == [before(stage)])
+    progress = Progress(REMAP_STAGES, lambda state: at.append(state.stage), lambda: at[-1:] == [previous_stage(stage)])
     with pytest.raises(CancelledError):
         remap(catalog, DOMAIN, config(), evaluator, progress if stage != "read frames" else cancelled())
     assert catalog.maps(DOMAIN) == []
@@ -108,8 +108,8 @@ def test_cancelled_at_any_stage_it_leaves_nothing_behind(catalog, drive, evaluat
     assert catalog.domain(DOMAIN).active_version is None
 
 
-def before(stage):
-    """Once this stage was told, the next report stops the work."""
+def previous_stage(stage):
+    """The stage before one; a cancel that comes with its report stops the work at the next."""
     stages = list(REMAP_STAGES)
     return stages[max(0, stages.index(stage) - 1)]
 
@@ -130,13 +130,13 @@ def route(catalog):
     def store(plane=False):
         rng = np.random.default_rng(3)
         places = rng.normal(size=(PLACES, 16))
-        known = np.arange(PLACES, dtype=float) if plane else np.full(PLACES, np.nan)
-        for name, seen in (("drive", places), ("other", places), ("strange", rng.normal(size=places.shape))):
+        known_m = np.arange(PLACES, dtype=float) if plane else np.full(PLACES, np.nan)
+        for name, season_places in (("drive", places), ("other", places), ("strange", rng.normal(size=places.shape))):
             frames = Drive(
                 position_m=np.arange(PLACES, dtype=float),
-                x_m=known,
-                y_m=0 * known,
-                encodings=(seen + 0.3 * rng.normal(size=seen.shape)).astype(np.float32),
+                x_m=known_m,
+                y_m=0 * known_m,
+                encodings=(season_places + 0.3 * rng.normal(size=season_places.shape)).astype(np.float32),
             )
             with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:
                 traverse.put_frames(frames)
@@ -145,7 +145,7 @@ def route(catalog):
 
 
 @pytest.mark.parametrize(
-    ("relevance", "plane", "asked", "accepted", "why"),
+    ("relevance", "plane", "parameters", "accepted", "reason"),
     [
         (Relevance.COMPOSED, False, {}, False, "without x, y of both drives nothing says"),
         (Relevance.COMPOSED, False, {"same_route": True}, True, None),
@@ -158,16 +158,18 @@ def route(catalog):
     ],
 )
 def test_a_second_drive_is_learnt_from_only_on_the_same_route(
-    catalog, route, evaluator, relevance, plane, asked, accepted, why
+    catalog, route, evaluator, relevance, plane, parameters, accepted, reason
 ):
     """One verdict holds for the likelihood, for whitening, and for the live images of training."""
     route(plane)
-    asked = config(n_landmarks=60, training_episodes=20, relevance=relevance, **asked)
-    metrics = remap(catalog, DOMAIN, asked, evaluator, Progress(REMAP_STAGES))["metrics"]
+    parameters = config(n_landmarks=60, training_episodes=20, relevance=relevance, **parameters)
+    metrics = remap(catalog, DOMAIN, parameters, evaluator, Progress(REMAP_STAGES))["metrics"]
     season = metrics["second_season"]
     assert season["accepted"] is accepted
-    assert season["why"] is None if why is None else why in season["why"]
-    assert (season["significance"] is None) == (season["n_pairs"] == 0) == (why is not None and "agree" not in why)
+    assert season["why"] is None if reason is None else reason in season["why"]
+    assert (
+        (season["significance"] is None) == (season["n_pairs"] == 0) == (reason is not None and "agree" not in reason)
+    )
     assert metrics["training"]["live_images"] == ("landmark_traverse" if accepted else "held_out_frames")
     assert catalog.map(DOMAIN, 1).metrics["second_season"] == season
     contents = read_map(catalog.map_path(DOMAIN, 1))
@@ -187,8 +189,8 @@ def test_where_landmarks_stay_the_active_maps_drive_is_judged(catalog, route, ev
     route()
     remap(catalog, DOMAIN, config(training_episodes=0), evaluator, Progress(REMAP_STAGES))
     later = config(training_traverse="strange", landmark_traverse=None, n_landmarks=None, training_episodes=0)
-    told = remap(catalog, DOMAIN, replace(later, same_route=True), evaluator, Progress(REMAP_STAGES))
-    assert told["metrics"]["second_season"]["accepted"] is False
+    result = remap(catalog, DOMAIN, replace(later, same_route=True), evaluator, Progress(REMAP_STAGES))
+    assert result["metrics"]["second_season"]["accepted"] is False
     again = remap(catalog, DOMAIN, config(training_episodes=0), evaluator, Progress(REMAP_STAGES))
     back = config(training_traverse="other", landmark_traverse=None, n_landmarks=None, same_route=True)
     assert again["map_version"] == 3
@@ -202,37 +204,37 @@ SIZE = (12_000, 12_000, 512)
 
 
 def test_the_stages_stay_the_same_and_none_weighs_nothing():
-    for asked in (CONFIG, replace(CONFIG, training_episodes=0), RemapConfig("drive", append=True)):
+    for parameters in (CONFIG, replace(CONFIG, training_episodes=0), RemapConfig("drive", append=True)):
         for size in (SIZE, (0, 0, 0)):
-            stages = remap_stages(asked, *size)
+            stages = remap_stages(parameters, *size)
             assert list(stages) == list(REMAP_STAGES)
             assert min(stages.values()) > 0
 
 
 def test_stages_weigh_by_what_they_have_to_do():
     def trained(n_episodes, n_frames=12_000, **changes):
-        asked = replace(CONFIG, training_episodes=n_episodes, **changes)
-        return remap_stages(asked, n_frames, 12_000, 512)["train"]
+        parameters = replace(CONFIG, training_episodes=n_episodes, **changes)
+        return remap_stages(parameters, n_frames, 12_000, 512)["train"]
 
     assert trained(300_000) == pytest.approx(30 * trained(10_000), rel=0.01)
     assert trained(10_000_000) == trained(25 * 12_000), "a map takes so many"
     assert trained(300_000, 100) == trained(2_500, 100)
     assert trained(10_000, append=True, landmark_traverse=None) < 0.1 < trained(10_000)
     assert trained(10_000, relevance=Relevance.BRUTE_FORCE) < 0.1
-    kept = remap_stages(RemapConfig("drive"), 12_000, 0, 512)
-    assert 0.1 < kept["describe"] < 0.6 * remap_stages(CONFIG, *SIZE)["describe"]
+    stages = remap_stages(RemapConfig("drive"), 12_000, 0, 512)
+    assert 0.1 < stages["describe"] < 0.6 * remap_stages(CONFIG, *SIZE)["describe"]
 
 
 def test_the_size_is_that_of_the_traverses(catalog, drive):
     drive("drive", 12)
     drive("other", 30)
     drive("empty", 0)
-    for asked, size in (
+    for parameters, size in (
         (CONFIG, (12, 30, 6)),
         (RemapConfig("drive"), (12, 0, 6)),
         (RemapConfig("empty", "drive"), (0, 12, 0)),
     ):
-        assert stages_in(catalog.data_dir, DOMAIN, asked) == remap_stages(asked, *size)
+        assert stages_in(catalog.data_dir, DOMAIN, parameters) == remap_stages(parameters, *size)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def running(catalog, run_job=None, on_activated=lambda domain: None):
         runner.close()
 
 
-def ended(catalog, job_id):
+def ended_job(catalog, job_id):
     give_up = time.monotonic() + WITHIN_S
     while time.monotonic() < give_up:
         job = catalog.job(job_id)
@@ -58,7 +58,7 @@ def drives(drive):
 
 def test_a_job_of_one_id_is_made_once_whoever_asks_and_whenever(catalog, drives):
     gate = Gate(catalog.data_dir)
-    job_id, made = "a" * 32, []
+    job_id, job_ids = "a" * 32, []
     runner = JobRunner(catalog, gate, lambda domain: None, max_waiting=1)
     try:
         first = runner.submit(DOMAIN, CONFIG, job_id)
@@ -67,25 +67,25 @@ def test_a_job_of_one_id_is_made_once_whoever_asks_and_whenever(catalog, drives)
 
         def ask():
             other.wait(WITHIN_S)
-            made.append(runner.submit(DOMAIN, CONFIG, "b" * 32).job_id)
+            job_ids.append(runner.submit(DOMAIN, CONFIG, "b" * 32).job_id)
 
         asking = [threading.Thread(target=ask) for _ in range(8)]
         for thread in asking:
             thread.start()
         for thread in asking:
             thread.join(WITHIN_S)
-        assert made == ["b" * 32] * 8, "one alone finds room to wait; the others find that one"
+        assert job_ids == ["b" * 32] * 8, "one alone finds room to wait; the others find that one"
         with pytest.raises(IdempotencyKeyReusedError):
             runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=7), job_id)
         gate.open.set()
-        ended(catalog, "b" * 32)
+        ended_job(catalog, "b" * 32)
     finally:
         gate.open.set()
         runner.close()
     assert runner.submit(DOMAIN, CONFIG, job_id).state is JobState.SUCCEEDED, "nothing new is asked of it"
     with running(catalog) as again:
-        found = again.submit(DOMAIN, CONFIG, job_id)
-        assert (found.job_id, found.created_at, found.result["map_version"]) == (job_id, first.created_at, 1)
+        job = again.submit(DOMAIN, CONFIG, job_id)
+        assert (job.job_id, job.created_at, job.result["map_version"]) == (job_id, first.created_at, 1)
         with pytest.raises(IdempotencyKeyReusedError):
             again.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=7), job_id)
     assert [record.version for record in catalog.maps(DOMAIN)] == [1, 2]
@@ -95,7 +95,7 @@ def test_a_job_that_meets_damage_says_in_which_traverse(catalog, drives):
     path = catalog.data_dir / "domains" / DOMAIN / "traverses" / "other.sqlite"
     path.write_bytes(b"no database" * 1000)
     with running(catalog) as runner:
-        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+        job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
     assert (job.state, job.error["code"], job.error["file"]) == (JobState.FAILED, "damaged_file", "other.sqlite")
     assert job.error["message"].startswith("other.sqlite is damaged")
 
@@ -107,26 +107,26 @@ def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog
         assert gate.entered.wait(WITHIN_S)
         runner.cancel(job.job_id)
         gate.open.set()
-        job = ended(catalog, job.job_id)
+        job = ended_job(catalog, job.job_id)
         assert job.state is JobState.CANCELLED
         assert job.error["code"] == "cancelled"
         assert catalog.maps(DOMAIN) == []
-        assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
+        assert ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
 
 
 def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog, drives, caplog):
     broken = [True]
-    whole = InThisProcess(catalog.data_dir)
+    sound_run = InThisProcess(catalog.data_dir)
 
     def run_job(job, on_progress, is_cancelled):
         if broken.pop():
             raise ZeroDivisionError("secret")
-        return whole(job, on_progress, is_cancelled)
+        return sound_run(job, on_progress, is_cancelled)
 
     with running(catalog, run_job) as runner:
-        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+        job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
         broken.append(False)
-        assert ended(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED
+        assert ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED
     assert job.state is JobState.FAILED
     assert job.error["code"] == "internal_error"
     assert "secret" not in str(job.error)
@@ -154,7 +154,7 @@ def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, dr
     with Catalog.open(data_dir) as again:
         assert again.discard_unfinished() == []
         with running(again):
-            assert [ended(again, job.job_id).result["map_version"] for job in (first, second)] == [1, 2]
+            assert [ended_job(again, job.job_id).result["map_version"] for job in (first, second)] == [1, 2]
         assert again.discard_unfinished() == []
 
 
@@ -171,11 +171,11 @@ def test_a_job_that_was_cancelled_as_the_service_stops_stays_cancelled(catalog, 
     assert catalog.job(job.job_id).state is JobState.CANCELLED
 
 
-def dying(catalog, before):
+def dying(catalog, is_before):
     """Does a job until its process dies, before or after its last step."""
 
     def run_job(job, on_progress, is_cancelled):
-        if not before:
+        if not is_before:
             InThisProcess(catalog.data_dir)(job, on_progress, is_cancelled)
         with Catalog.open(catalog.data_dir) as child:
             version = child.begin_map(DOMAIN, {})
@@ -186,8 +186,8 @@ def dying(catalog, before):
 
 
 def test_a_job_whose_process_died_has_failed_and_leaves_no_half_map(catalog, drives):
-    with running(catalog, dying(catalog, before=True)) as runner:
-        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+    with running(catalog, dying(catalog, is_before=True)) as runner:
+        job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
     assert job.state is JobState.FAILED
     assert (job.error["code"], job.error["signal"]) == ("job_interrupted", "SIGKILL")
     assert catalog.maps(DOMAIN) == []
@@ -196,7 +196,7 @@ def test_a_job_whose_process_died_has_failed_and_leaves_no_half_map(catalog, dri
 
 def test_a_job_whose_process_died_behind_its_last_step_has_succeeded(catalog, drives):
     activated = []
-    with running(catalog, dying(catalog, before=False), activated.append) as runner:
-        job = ended(catalog, runner.submit(DOMAIN, CONFIG).job_id)
+    with running(catalog, dying(catalog, is_before=False), activated.append) as runner:
+        job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
     assert (job.state, job.result["map_version"], job.error) == (JobState.SUCCEEDED, 1, None)
     assert activated == [DOMAIN]

@@ -26,39 +26,39 @@ def drives(noise: float = 0.4, seed: int = 0) -> tuple[Drive, Drive]:
     rng = np.random.default_rng(seed)
     places = rng.normal(size=(N, R))
 
-    def seen() -> Drive:
+    def season() -> Drive:
         views = (places + noise * rng.normal(size=(N, R))).astype(np.float32)
         return Drive(position_m=np.arange(N, dtype=float), encodings=views, dissimilarities=views)
 
-    return seen(), seen()
+    return season(), season()
 
 
-def trained(relevance=Relevance.RRF, second=None, own=None, config=None, on_progress=lambda _: None):
-    own, actions_m, config = own or drives()[0], (1.0, 2.0, 5.0), config or NnqlConfig(n_episodes=200)
+def train_map(relevance=Relevance.RRF, second=None, map_drive=None, config=None, on_progress=lambda _: None):
+    map_drive, actions_m, config = map_drive or drives()[0], (1.0, 2.0, 5.0), config or NnqlConfig(n_episodes=200)
     if relevance is Relevance.COMPOSED:
-        built = compose_map(MapPlan(relevance, 4, actions_m, same_route=True), own, second, second, R)
-        return train_nnql(built.rehearsal, built.map_drive, built.second, config, on_progress)
-    map_ = replace(build_map(relevance, own, 4), actions_m=np.array(actions_m))
-    return train_nnql(map_, own, second, config, on_progress)
+        map_build = compose_map(MapPlan(relevance, 4, actions_m, same_route=True), map_drive, second, second, R)
+        return train_nnql(map_build.rehearsal, map_build.map_drive, map_build.second, config, on_progress)
+    map_ = replace(build_map(relevance, map_drive, 4), actions_m=np.array(actions_m))
+    return train_nnql(map_, map_drive, second, config, on_progress)
 
 
 @pytest.fixture
 def worlds(monkeypatch):
     """Every world that training makes: its map, views and the route they lie on."""
-    seen = []
+    arguments = []
     on = TrainingWorld.on
 
     def recording(map_, views, live_route, *rest):
-        seen.append((map_, views, live_route))
+        arguments.append((map_, views, live_route))
         return on(map_, views, live_route, *rest)
 
     monkeypatch.setattr(TrainingWorld, "on", recording)
-    return seen
+    return arguments
 
 
 def test_a_second_drive_of_the_route_gives_the_live_images(worlds):
-    own, second = drives()
-    q_values, metrics = trained(second=second, own=own)
+    map_drive, second = drives()
+    q_values, metrics = train_map(second=second, map_drive=map_drive)
     assert metrics["live_images"] == SECOND_DRIVE
     assert metrics["n_episodes"] == 200
     ((map_, views, _),) = worlds
@@ -70,15 +70,15 @@ def test_a_second_drive_of_the_route_gives_the_live_images(worlds):
 
 
 def test_else_alternate_frames_are_held_out_of_the_map_they_look_at(worlds):
-    own, _ = drives()
-    q_values, metrics = trained(own=own)
+    map_drive, _ = drives()
+    q_values, metrics = train_map(map_drive=map_drive)
     assert metrics["live_images"] == HELD_OUT
     assert len(metrics["curves"]) == len(worlds) == 2
     for map_, _, live_route in worlds:
         assert not set(map_.position_m) & set(live_route.position_m), "a live image is a map image"
         assert map_.n_images == N // 2
         for image, position_m in enumerate(map_.position_m):  # the half's lists are those of its frames
-            nearest = np.argsort(own.dissimilarities[int(position_m)], kind="stable")[:4]
+            nearest = np.argsort(map_drive.dissimilarities[int(position_m)], kind="stable")[:4]
             assert map_.lists[:, image].tolist() == nearest.tolist()
     touched = (q_values != np.float32(1e-4)).any(axis=1)
     assert touched[::2].mean() > 0.5
@@ -87,27 +87,27 @@ def test_else_alternate_frames_are_held_out_of_the_map_they_look_at(worlds):
 
 @pytest.mark.parametrize("relevance", list(Relevance))
 def test_maps_for_every_relevance_learn(relevance):
-    own, second = drives()
+    map_drive, second = drives()
     for live in (None, second):
-        q_values, _ = trained(relevance, live, own, NnqlConfig(n_episodes=40))
+        q_values, _ = train_map(relevance, live, map_drive, NnqlConfig(n_episodes=40))
         assert np.isfinite(q_values).all()
         assert (q_values > 1).any()
 
 
 def test_small_maps_take_fewer_episodes_and_one_image_none():
-    own, _ = drives()
-    assert trained(own=own.at(np.arange(6)), config=NnqlConfig())[1]["n_episodes"] == 150
-    q_values, metrics = trained(own=own.at(np.arange(1)))
+    map_drive, _ = drives()
+    assert train_map(map_drive=map_drive.at(np.arange(6)), config=NnqlConfig())[1]["n_episodes"] == 150
+    q_values, metrics = train_map(map_drive=map_drive.at(np.arange(1)))
     assert q_values.tolist() == [[np.float32(1e-4)] * 3]
     assert metrics["curves"] == []
-    nothing, _ = trained(second=drives()[1], config=NnqlConfig(n_episodes=0))
-    assert (nothing == np.float32(1e-4)).all()
+    untrained, _ = train_map(second=drives()[1], config=NnqlConfig(n_episodes=0))
+    assert (untrained == np.float32(1e-4)).all()
 
 
 def test_progress_rises_and_a_cancel_gets_through():
     for second in (None, drives()[1]):
         shares: list[float] = []
-        trained(second=second, on_progress=shares.append)
+        train_map(second=second, on_progress=shares.append)
         assert shares == sorted(shares)
         assert shares[-1] == 1.0
 
@@ -115,7 +115,7 @@ def test_progress_rises_and_a_cancel_gets_through():
             raise CancelledError("asked to stop")
 
         with pytest.raises(CancelledError):
-            trained(second=second, on_progress=cancel)
+            train_map(second=second, on_progress=cancel)
 
 
 def remap_config(**changes):

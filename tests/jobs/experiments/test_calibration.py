@@ -42,7 +42,7 @@ def drives():
     rng = np.random.default_rng(2)
     places = rng.normal(size=(N, 12))
     seasons = [places + noise * rng.normal(size=places.shape) for noise in (0.5, 0.2, 0.6)]
-    return [Drive(position_m=np.arange(N, dtype=float), encodings=each.astype(np.float32)) for each in seasons]
+    return [Drive(position_m=np.arange(N, dtype=float), encodings=season.astype(np.float32)) for season in seasons]
 
 
 @pytest.fixture(scope="module")
@@ -111,19 +111,19 @@ def test_robots_look_where_they_are_and_report_their_moves(report, drives, evalu
     map_, algorithm = localizer
     views = views_of(measure_drive(drives[2], map_.landmark_model, evaluator))
     for stage, moved_m in (("moves of 3 m", 3.0), ("odometry times 0.9", 4.5), ("odometry times 1.1", 5.5)):
-        seen, state, start = report.sights[stage], algorithm.start(), 4
+        sight, state, start = report.sights[stage], algorithm.start(), 4
         step_m = 3 if stage.startswith("moves") else 5
-        for view in range(seen.set_m.shape[1]):
+        for view in range(sight.set_m.shape[1]):
             state = algorithm.step(state, views.at(start + step_m * view), moved_m).state
             mass = state.belief.mass
-            assert seen.set_m[start, view] == pytest.approx(map_.route.cell_m[smallest_set(mass)].sum())
-            assert seen.is_covered[start, view] == smallest_set(mass)[start + step_m * view]
-            assert seen.is_near[start, view] == (abs(int(mass.argmax()) - start - step_m * view) <= 5)
-            assert seen.off_route[start, view] == pytest.approx(state.belief.off_route)
+            assert sight.set_m[start, view] == pytest.approx(map_.route.cell_m[smallest_set(mass)].sum())
+            assert sight.is_covered[start, view] == smallest_set(mass)[start + step_m * view]
+            assert sight.is_near[start, view] == (abs(int(mass.argmax()) - start - step_m * view) <= 5)
+            assert sight.off_route[start, view] == pytest.approx(state.belief.off_route)
 
 
 def test_how_many_robots_and_views_there_are(report):
-    shapes = {stage: seen.set_m.shape for stage, seen in report.sights.items()}
+    shapes = {stage: sight.set_m.shape for stage, sight in report.sights.items()}
     assert shapes["moves of 1 m"] == (N - 10, 11)
     assert shapes["moves of 10 m"] == (N - 100, 11)
     assert shapes["standing"] == (3, 150)
@@ -138,9 +138,9 @@ def test_a_move_past_the_end_is_refused_and_changes_nothing(drives, evaluator, l
     views = views_of(measure_drive(drives[2], map_.landmark_model, evaluator))
     course = _Course(algorithm, DrivenByTest(views, drives[2].route(), np.arange(N)), QUICK)
     path_m = np.r_[N - 51 + 5.0 * np.arange(11), N - 1.0][np.newaxis]
-    seen = course.drive_robots(path_m, np.r_[np.full(11, 5.0), N + 30.0], lambda _: None)
-    assert seen.is_refused[0].tolist() == [0] * 11 + [1]
-    assert seen.near_mode[0, 11] == seen.near_mode[0, 10]
+    sight = course.drive_robots(path_m, np.r_[np.full(11, 5.0), N + 30.0], lambda _: None)
+    assert sight.is_refused[0].tolist() == [0] * 11 + [1]
+    assert sight.near_mode[0, 11] == sight.near_mode[0, 10]
 
 
 def test_a_drive_too_short_is_named(drives, evaluator):
@@ -177,7 +177,7 @@ def test_places_unlike_each_other_are_told_apart(document):
 
 
 def test_who_was_carried_is_far_from_where_it_was_tracked_to(report):
-    """Well tracked before, and at first believed to be there still."""
+    """A robot that was carried was tracked well before, and is at first believed to be there still."""
     carried = report.sights["carried"].is_near
     assert carried[:, 10].mean() > 0.8
     assert carried[:, 11].mean() < 0.5
@@ -185,10 +185,10 @@ def test_who_was_carried_is_far_from_where_it_was_tracked_to(report):
 
 
 def test_the_command_prints_a_table_and_writes_json(drives, report, tmp_path, monkeypatch):
-    asked = []
+    calls = []
 
-    def run(config, evaluator, *others):
-        asked.append((config, [drive.n_frames for drive in others[:3]]))
+    def run(config, evaluator, *drives_and_progress):
+        calls.append((config, [drive.n_frames for drive in drives_and_progress[:3]]))
         return replace(report, config=config)
 
     monkeypatch.setattr(importlib.import_module("deepsimbad.cli.experiment"), "run_calibration", run)
@@ -197,24 +197,33 @@ def test_the_command_prints_a_table_and_writes_json(drives, report, tmp_path, mo
         np.save(tmp_path / f"{role}.npy", drive.encodings[: -2 if role == "test" else None])
         sources += [f"--{role}", tmp_path / f"{role}.npy"]
     options = ("--evaluator", "feature_l2:none", "--n-landmarks", 60, "--list-length", 3, "--seed", 4)
-    given = (*sources, *options, "--filter", "particle", "--relevance", "standardised", "--json", tmp_path / "out.json")
-    ran = CliRunner().invoke(commands, ["experiment", "calibration", *map(str, given)])
+    arguments = (
+        *sources,
+        *options,
+        "--filter",
+        "particle",
+        "--relevance",
+        "standardised",
+        "--json",
+        tmp_path / "out.json",
+    )
+    ran = CliRunner().invoke(commands, ["experiment", "calibration", *map(str, arguments)])
     assert ran.exit_code == 0, ran.output
     config = CalibrationConfig(60, 3, Relevance.STANDARDISED, FilterKind.PARTICLE, seed=4)
-    assert asked == [(config, [N, N, N - 2])]
-    written = json.loads((tmp_path / "out.json").read_text())
-    assert written["config"]["filter"] == "particle"
+    assert calls == [(config, [N, N, N - 2])]
+    document = json.loads((tmp_path / "out.json").read_text())
+    assert document["config"]["filter"] == "particle"
     (row,) = [line for line in ran.output.splitlines() if line.startswith("│ 10 ")]
-    assert f"{written['coverage_95']['10']['5']:.1f} / {written['set_m']['10']['5']:.0f}" in row
-    assert f"found after {written['carried']['views_median']:.0f} views" in ran.output
+    assert f"{document['coverage_95']['10']['5']:.1f} / {document['set_m']['10']['5']:.0f}" in row
+    assert f"found after {document['carried']['views_median']:.0f} views" in ran.output
 
 
 def test_the_filter_and_seed_asked_for_are_the_robots(drives, evaluator):
     landmarks, training, test = drives
     plan = MapPlan(Relevance.RRF, 4, (5.0,))
-    built = build(plan, training, None, landmarks, 20, evaluator)
+    map_build = build(plan, training, None, landmarks, 20, evaluator)
     for kind, belief in ((FilterKind.GRID, GridFilter), (FilterKind.PARTICLE, ParticleFilter)):
         config = CalibrationConfig(filter=kind, seed=5)
-        started = _course(config, evaluator, built, test, np.arange(N)).localizer.start().belief
-        assert type(started) is belief
-        assert getattr(started, "seed", 5) == 5
+        start_belief = _course(config, evaluator, map_build, test, np.arange(N)).localizer.start().belief
+        assert type(start_belief) is belief
+        assert getattr(start_belief, "seed", 5) == 5

@@ -14,23 +14,23 @@ from deepsimbad.jobs.experiments.nbv import TestDrive as Drive
 
 @dataclass
 class Notebook:
-    """In the localizer's place: writes down what it is told, and believes what `believe` says of a view."""
+    """Stands for the localizer: records its calls, and has the belief that `believe` gives for a view."""
 
     believe: object = None
     apart_m: float = 1.0  # its five map images: within 5 m of each other, so that it is sure from the first view on
-    told: list = field(default_factory=list)
+    calls: list = field(default_factory=list)
 
     def start(self):
         return SimpleNamespace(n_observations=0, views=())
 
     def step(self, state, query, action_m=0.0, action_std_m=None):
-        self.told.append((state.n_observations, query, action_m, action_std_m))
+        self.calls.append((state.n_observations, query, action_m, action_std_m))
         views = (*state.views, query)
         mass = np.ones(5) / 5 if self.believe is None else self.believe(views)
         route = Route(self.apart_m * np.arange(5))
         belief = SimpleNamespace(mass=mass, route=route, off_route=0.0)
-        after = SimpleNamespace(n_observations=state.n_observations + 1, views=views, belief=belief)
-        return SimpleNamespace(state=after, plan=Plan("p", 1.0 + len(views)))
+        new_state = SimpleNamespace(n_observations=state.n_observations + 1, views=views, belief=belief)
+        return SimpleNamespace(state=new_state, plan=Plan("p", 1.0 + len(views)))
 
 
 class Frames:
@@ -68,7 +68,7 @@ def test_the_robot_moves_exactly_so_far_and_looks_from_the_nearest_frame(drive):
     notebook = Notebook()
     episode = EpisodeRunner(notebook, drive, 3, action_std_m=0.7).run(0, 1, lambda *_: 2.5)
     # 0.9, 3.4, 5.9, 8.4 m: what is walked adds up, whatever frame was nearest
-    assert notebook.told == [(0, 1, 0.0, None), (1, 3, 2.5, 0.7), (2, 6, 2.5, 0.7), (3, 8, 2.5, 0.7)]
+    assert notebook.calls == [(0, 1, 0.0, None), (1, 3, 2.5, 0.7), (2, 6, 2.5, 0.7), (3, 8, 2.5, 0.7)]
     assert episode.travelled_m.tolist() == [2.5, 5.0, 7.5]
 
 
@@ -120,8 +120,8 @@ def test_the_clairvoyant_takes_the_move_after_which_the_truth_ranks_best(drive):
     episode = runner.run(0, 0, chooser)
     assert episode.travelled_m.tolist() == [5, 8]
     assert episode.rank_share.tolist() == [0, 0]
-    taken = [told for told in notebook.told if told[0] == 2]
-    assert len(taken) == 4, "three tries and the move itself, all from the same state"
+    calls = [call for call in notebook.calls if call[0] == 2]
+    assert len(calls) == 4, "three tries and the move itself, all from the same state"
 
 
 def test_of_equally_good_moves_the_clairvoyant_takes_the_shortest(drive):

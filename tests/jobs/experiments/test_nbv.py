@@ -27,11 +27,11 @@ def drives(tmp_path_factory):
 
 
 def experiment(sources, evaluator, config, progress=None, spacing_m=1.0):
-    driven = [
+    triplet = [
         encode_recording(open_source(sources[role], spacing_m=spacing_m), evaluator, 1, lambda _: None).drive
         for role in ("landmarks", "training", "test")
     ]
-    return run_nbv(config, evaluator, *driven, progress or Progress(nbv_stages(config)))
+    return run_nbv(config, evaluator, *triplet, progress or Progress(nbv_stages(config)))
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +44,20 @@ def report(drives, evaluator) -> NbvReport:
 
 def slow_paper(rows, config, moves):
     """Rank shares [episodes, steps] where episode e makes moves[e] from the e-th start."""
-    candidates, mapped, live = rows
-    apart = np.array([((candidates - each) ** 2).sum(axis=1) for each in candidates])
-    np.fill_diagonal(apart, np.inf)
-    chosen = sorted(range(len(candidates)), key=lambda c: (-apart[c].min(), c))[: config.n_landmarks]
-    landmarks = candidates[chosen]
+    candidates, map_rows, live = rows
+    distances = np.array([((candidates - row) ** 2).sum(axis=1) for row in candidates])
+    np.fill_diagonal(distances, np.inf)
+    landmark_rows = sorted(range(len(candidates)), key=lambda c: (-distances[c].min(), c))[: config.n_landmarks]
+    landmarks = candidates[landmark_rows]
 
     def ranks_of(encodings):
-        order = [np.argsort(((landmarks - each) ** 2).sum(axis=1), kind="stable") for each in encodings]
+        order = [np.argsort(((landmarks - row) ** 2).sum(axis=1), kind="stable") for row in encodings]
         return np.argsort(order, axis=1) + 1
 
-    map_ranks, live_ranks = ranks_of(mapped), ranks_of(live)
+    map_ranks, live_ranks = ranks_of(map_rows), ranks_of(live)
     features = np.where(map_ranks <= config.list_length, 1 / map_ranks, 0.0)
     relevance = (1 / live_ranks) @ features.T  # [frames, images]
-    n = len(mapped)
+    n = len(map_rows)
     last_start = len(live) - 1 - config.n_steps * int(max(config.actions_m))
     starts = np.random.default_rng(config.seed).choice(np.arange(last_start + 1), config.episodes)
     off = np.subtract.outer(np.arange(n), np.arange(n))
@@ -70,9 +70,9 @@ def slow_paper(rows, config, moves):
         belief = weights / weights.sum()
         for step, action in enumerate(moves[episode]):
             frame += int(action)
-            moved = np.zeros(n)
-            moved[int(action) :] = belief[: n - int(action)]
-            weights = n * (moved / moved.sum()) @ blur + relevance[frame]
+            shifted = np.zeros(n)
+            shifted[int(action) :] = belief[: n - int(action)]
+            weights = n * (shifted / shifted.sum()) @ blur + relevance[frame]
             belief = weights / weights.sum()
             tied = np.isclose(belief, belief[frame], rtol=1e-7, atol=0)
             shares[episode, step] = ((belief[~tied] > belief[frame]).sum() + 0.5 * (tied.sum() - 1)) / n
@@ -144,9 +144,9 @@ def test_the_clairvoyant_is_no_worse_than_any_single_move(report):
 def test_the_truth_is_the_map_image_nearest_in_metres(drives, evaluator):
     """Part of the mapped drive itself, driven again: frame i of the test is not map image i."""
     config = replace(QUICK, episodes=30, training_episodes=0)
-    same = experiment({**drives, "test": drives["training"] + "#31:90:2"}, evaluator, config)
-    assert shares_of(same.our_episodes["constant_4"]).mean() < 0.002
-    assert shares_of(same.paper_episodes["constant_4"]).mean() < 0.02
+    report = experiment({**drives, "test": drives["training"] + "#31:90:2"}, evaluator, config)
+    assert shares_of(report.our_episodes["constant_4"]).mean() < 0.002
+    assert shares_of(report.paper_episodes["constant_4"]).mean() < 0.02
 
 
 def test_a_test_drive_too_short_is_named(drives, evaluator):
@@ -156,9 +156,9 @@ def test_a_test_drive_too_short_is_named(drives, evaluator):
 
 
 def test_stages_are_reported_and_the_whole_can_be_cancelled(drives, evaluator):
-    told = []
-    experiment(drives, evaluator, replace(QUICK, episodes=5), Progress(nbv_stages(QUICK), told.append))
-    assert list(dict.fromkeys(state.stage for state in told)) == list(nbv_stages(QUICK))
+    states = []
+    experiment(drives, evaluator, replace(QUICK, episodes=5), Progress(nbv_stages(QUICK), states.append))
+    assert list(dict.fromkeys(state.stage for state in states)) == list(nbv_stages(QUICK))
     stop = Progress(nbv_stages(QUICK), None, lambda: True)
     with pytest.raises(CancelledError):
         experiment(drives, evaluator, QUICK, stop)
@@ -177,7 +177,9 @@ def test_the_document_tells_what_was_measured(report):
         assert low <= document["anr"][name] <= high
         assert document["anr_by_step"][name] == pytest.approx([100 * shares[:, step].mean() for step in range(4)])
         for figure, part in (("views_to_confident", "views"), ("metres_to_confident", "metres")):
-            assert document[figure][name] == pytest.approx(np.mean([getattr(each, part) for each in episodes]))
+            assert document[figure][name] == pytest.approx(
+                np.mean([getattr(one_episode, part) for one_episode in episodes])
+            )
             low, high = document[figure]["interval_95"][name]
             assert low <= document[figure][name] <= high
         assert document["wrong_when_confident"][name] == 100 * np.mean([episode.is_wrong for episode in episodes])
@@ -192,23 +194,23 @@ def test_the_document_tells_what_was_measured(report):
 
 
 def episodes(shares, travelled_m=None, views=None):
-    """One an entry of [episodes, steps] rank shares."""
+    """One episode for every row of rank shares [episodes, steps]."""
     travelled_m = np.ones_like(shares) if travelled_m is None else travelled_m
     views = np.ones(len(shares)) if views is None else views
-    return [Episode(*each, metres=0.0, is_wrong=False) for each in zip(shares, travelled_m, views, strict=True)]
+    return [Episode(*fields, metres=0.0, is_wrong=False) for fields in zip(shares, travelled_m, views, strict=True)]
 
 
 def test_differences_are_those_of_the_same_starts():
     """The default is better by one hundredth everywhere; how hard a start is does not blur that."""
     hard = np.random.default_rng(0).random((200, 3)) / 2
     views = 20 * hard[:, 0]
-    ours = {
+    by_planner = {
         "informed": episodes(hard, views=views),
         "random": episodes(hard + 0.01, views=views + 3),
         "constant_1": episodes(hard, views=views + 2),
         "constant_9": episodes(hard + 0.02, views=views + 1),
     }
-    report = NbvReport(QUICK, ours, ours, np.arange(200) // 20)
+    report = NbvReport(QUICK, by_planner, by_planner, np.arange(200) // 20)
     document = report.as_dict({})
     assert document["difference_95"]["informed - random"] == pytest.approx([-1, -1])
     assert document["difference_95"]["informed - constant_9"] == pytest.approx([-2, -2])
@@ -219,10 +221,10 @@ def test_differences_are_those_of_the_same_starts():
 def test_starts_of_one_stretch_count_as_one():
     """Equal episodes of one stretch of 20 m do not make an interval narrower than stretches do."""
     shares = np.repeat(np.random.default_rng(0).random((10, 3)), 20, axis=0)
-    ours = dict.fromkeys(("informed", "random", "constant_1"), episodes(shares))
+    by_planner = dict.fromkeys(("informed", "random", "constant_1"), episodes(shares))
 
     def width(block):
-        low, high = NbvReport(QUICK, ours, ours, block).as_dict({})["interval_95"]["random"]
+        low, high = NbvReport(QUICK, by_planner, by_planner, block).as_dict({})["interval_95"]["random"]
         return high - low
 
     assert width(np.arange(200) // 20) > 2 * width(np.arange(200))
@@ -231,8 +233,8 @@ def test_starts_of_one_stretch_count_as_one():
 def test_at_a_distance_the_last_view_before_it_counts():
     shares = np.array([[0.5, 0.4, 0.3], [0.6, 0.2, 0.1], [0.9, 0.9, 0.9]])
     travelled = np.array([[4.0, 9.0, 12.0], [10.0, 20.0, 30.0], [1.0, 2.0, 3.0]])
-    ours = dict.fromkeys(("informed", "random", "constant_1"), episodes(shares, travelled))
-    document = NbvReport(QUICK, ours, ours, np.arange(3)).as_dict({})
+    by_planner = dict.fromkeys(("informed", "random", "constant_1"), episodes(shares, travelled))
+    document = NbvReport(QUICK, by_planner, by_planner, np.arange(3)).as_dict({})
     at = document["anr_at_distance_m"]["random"]
     # 10 m: the second view of the first episode (9 m), the first of the second; the third never went so far
     assert at["10"] == pytest.approx(100 * (0.4 + 0.6) / 2)

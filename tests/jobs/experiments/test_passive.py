@@ -14,12 +14,16 @@ N = 60
 
 
 @pytest.fixture(scope="module")
-def driven(evaluator):
+def passive_drive(evaluator):
     """Scores of a drive that is 1.5 m apart on a map of 1 m, and what every view said of every map image."""
     rng = np.random.default_rng(1)
     place = rng.normal(size=(N, 12))
-    seen = np.repeat(np.arange(0, N, 3), 2)  # every third place and the middle of the next two
-    mixed = np.where(np.arange(seen.size)[:, np.newaxis] % 2, (place[seen + 1] + place[seen + 2]) / 2, place[seen])
+    place_of_view = np.repeat(np.arange(0, N, 3), 2)  # every third place and the middle of the next two
+    mixed = np.where(
+        np.arange(place_of_view.size)[:, np.newaxis] % 2,
+        (place[place_of_view + 1] + place[place_of_view + 2]) / 2,
+        place[place_of_view],
+    )
     test = drive_of(mixed + rng.normal(size=mixed.shape), 1.5)
     map_ = compose_map(MapPlan(Relevance.COMPOSED, 4, (1.0, 2.0)), drive_of(place, 1.0), None, None, 40).map
     views = views_of(measure_drive(test, map_.landmark_model, evaluator))
@@ -61,8 +65,8 @@ def slow_anr(sums, truth):
 
 
 @pytest.mark.parametrize("n_views", passive.WINDOWS)
-def test_sums_are_of_the_last_views_along_the_odometry(driven, n_views):
-    scores, rows, by_all, truth, _ = driven
+def test_sums_are_of_the_last_views_along_the_odometry(passive_drive, n_views):
+    scores, rows, by_all, truth, _ = passive_drive
     frames = range(n_views - 1, len(rows))
     true = truth[n_views - 1 :]
     for name, of, speeds in (
@@ -75,8 +79,8 @@ def test_sums_are_of_the_last_views_along_the_odometry(driven, n_views):
         assert scores.by_window[name][n_views].n_queries == len(frames)
 
 
-def test_a_belief_of_one_view_ranks_as_its_relevance_does_and_more_views_help(driven):
-    scores, *_, shares = driven
+def test_a_belief_of_one_view_ranks_as_its_relevance_does_and_more_views_help(passive_drive):
+    scores, *_, shares = passive_drive
     of_filter, of_sum = scores.by_window[passive.FILTER], scores.by_window[passive.SUM]
     assert of_filter[1].normalised_ranks.tolist() == of_sum[1].normalised_ranks.tolist()
     assert of_filter[10].anr < 0.5 * of_filter[1].anr
@@ -89,10 +93,10 @@ def test_of_a_long_drive_some_windows_are_compared(monkeypatch, evaluator):
     rng = np.random.default_rng(2)
     monkeypatch.setattr(passive, "_MOST_WINDOWS", 5)
     map_ = compose_map(
-        MapPlan(Relevance.COMPOSED, 4, (1.0,)), own := drive_of(rng.normal(size=(N, 12)), 1.0), None, None, 20
+        MapPlan(Relevance.COMPOSED, 4, (1.0,)), drive := drive_of(rng.normal(size=(N, 12)), 1.0), None, None, 20
     ).map
-    views = views_of(measure_drive(own, map_.landmark_model, evaluator))
+    views = views_of(measure_drive(drive, map_.landmark_model, evaluator))
     truth = [np.array([frame]) for frame in range(N)]
-    scores = passive.drive_in_order(map_, views, own.position_m, np.zeros((N, N)), truth, lambda _: None)
+    scores = passive.drive_in_order(map_, views, drive.position_m, np.zeros((N, N)), truth, lambda _: None)
     assert [scores.by_window[passive.FILTER][n].n_queries for n in passive.WINDOWS] == [5, 4, 4, 4, 3]
     assert scores.whole_drive.n_queries == N
