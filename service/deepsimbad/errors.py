@@ -39,9 +39,9 @@ def nearest_of(word: str, names: Iterable[str]) -> str:
     choices = list(names)
     if not choices:
         return ": there is none yet"
-    nearest = get_close_matches(word.lower(), choices, 1, 0.5) if len(word) <= _LONGEST_WORD else []
+    matches = get_close_matches(word.lower(), choices, 1, 0.5) if len(word) <= _LONGEST_WORD else []
     listing = ", ".join(choices[:_MOST_NAMED]) + (", ..." if len(choices) > _MOST_NAMED else "")
-    return f": did you mean {nearest[0]}? There is {listing}" if nearest else f": there is {listing}"
+    return f": did you mean {matches[0]}? There is {listing}" if matches else f": there is {listing}"
 
 
 class InvalidInputError(DeepSimbadError, code="invalid_input"):

@@ -239,8 +239,8 @@ def trace_settings(config: Path | None = None, **flags: object) -> TracedSetting
     }
     for origin, values in sources.items():
         for name in sorted(values.keys() - Settings.model_fields):
-            nearest = get_close_matches(name.lower(), Settings.model_fields, 1)
-            hint = f": did you mean {nearest[0]!r}?" if nearest else "; `deepsimbad settings` lists those there are"
+            matches = get_close_matches(name.lower(), Settings.model_fields, 1)
+            hint = f": did you mean {matches[0]!r}?" if matches else "; `deepsimbad settings` lists those there are"
             raise SettingsError(f"there is no setting {name!r}, which stands in {places[origin]}{hint}", setting=name)
     origins = {name: next(origin for origin in sources if name in sources[origin]) for name in Settings.model_fields}
     try:

@@ -19,12 +19,12 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
-def running():
+def services():
     return SimpleNamespace(long_work=CapacityLimiter(1))  # as much of the service as these need
 
 
 @pytest.mark.parametrize("n_blanks", [0, 1 << 16])
-async def test_a_long_body_is_read_in_a_thread(running, n_blanks, monkeypatch):
+async def test_a_long_body_is_read_in_a_thread(services, n_blanks, monkeypatch):
     threads = []
     parsed = FrameBody.model_validate_json
 
@@ -33,16 +33,16 @@ async def test_a_long_body_is_read_in_a_thread(running, n_blanks, monkeypatch):
         return parsed(body)
 
     monkeypatch.setattr(FrameBody, "model_validate_json", noting)
-    body = await parse_json(b'{"encoding":[1.5' + b" " * n_blanks + b"]}", FrameBody, running)
+    body = await parse_json(b'{"encoding":[1.5' + b" " * n_blanks + b"]}", FrameBody, services)
     assert body.encoding == (1.5,)
     assert (threads == [threading.get_ident()]) == (n_blanks == 0)
 
 
-async def test_a_body_of_too_many_numbers_is_refused_before_it_is_parsed(running):
+async def test_a_body_of_too_many_numbers_is_refused_before_it_is_parsed(services):
     body = b'{"encoding":[' + b"1," * (MAX_NUMBERS - 1) + b"1%s]}"
-    assert len((await parse_json(body % b"", FrameBody, running)).encoding) == MAX_NUMBERS
+    assert len((await parse_json(body % b"", FrameBody, services)).encoding) == MAX_NUMBERS
     with pytest.raises(InvalidRequestError, match="numbers"):
-        await parse_json(body % b",1", FrameBody, running)
+        await parse_json(body % b",1", FrameBody, services)
 
 
 @pytest.mark.parametrize(

@@ -87,10 +87,10 @@ def test_threads_that_are_all_taken_do_not_keep_health_waiting(busy):
 
 
 def test_only_so_many_streams_and_uploads_at_once(busy):
-    job, running = busy.get("/v1/admin/jobs").json()["jobs"][0]["job_id"], busy.services
+    job, services = busy.get("/v1/admin/jobs").json()["jobs"][0]["job_id"], busy.services
     frames = "/v1/admin/domains/ready/traverses/drive/frames"
     batch = {"content": npz(encodings=[[0.0] * DIM], index=[0], position_m=[0.0]), "headers": NPZ}
-    with running.event_streams.slot(), running.uploads.slot():
+    with services.event_streams.slot(), services.uploads.slot():
         overloaded(busy.get(f"/v1/admin/jobs/{job}/events"), "max_event_streams")
         overloaded(busy.post(frames, **batch), "max_uploads")
     for _ in range(2):  # what has ended makes room

@@ -38,7 +38,7 @@ from deepsimbad.api.door import SHUTTING_DOWN, Door
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics, StateCollector
 from deepsimbad.api.problems import install_openapi, install_problem_handlers, problems
-from deepsimbad.api.requests import Answer, Running, Services, Slots, StrictRoute
+from deepsimbad.api.requests import Answer, RunningServices, Services, Slots, StrictRoute
 from deepsimbad.engine.atlas import Atlas, Owners
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.events import SessionEvents
@@ -394,23 +394,23 @@ async def healthz() -> Health:
 
 
 @router.get("/readyz", responses=problems())
-async def readyz(running: Running) -> Readiness:
+async def readyz(services: RunningServices) -> Readiness:
     """What serves is there: threads that work, a catalog and sessions that can be read and written, room on the disk.
 
     Else 503, and `faults` says what is wrong; while shutting down too. A damaged map keeps its own domain alone from
     being served, and is told here.
     """
-    if running.stopping.is_set():
+    if services.stopping.is_set():
         raise UnavailableError(SHUTTING_DOWN.message, faults=[SHUTTING_DOWN.message])
-    faults = await run_sync(running.faults, limiter=running.health)
+    faults = await run_sync(services.faults, limiter=services.health)
     if faults:
         raise UnavailableError("; ".join(faults), faults=list(faults))
-    damaged = await run_sync(running.maps.damaged, limiter=running.health)
-    return Readiness(status="ready", damaged_maps=list(damaged))
+    damaged_versions = await run_sync(services.maps.damaged, limiter=services.health)
+    return Readiness(status="ready", damaged_maps=list(damaged_versions))
 
 
 @router.get("/metrics", response_class=PlainTextResponse, responses=problems())
-async def metrics(running: Running) -> Response:
+async def metrics(services: RunningServices) -> Response:
     """What Prometheus scrapes."""
-    content = await run_sync(running.metrics.render, limiter=running.health)
+    content = await run_sync(services.metrics.render, limiter=services.health)
     return Response(content, media_type=CONTENT_TYPE_LATEST)

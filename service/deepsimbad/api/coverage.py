@@ -13,7 +13,7 @@ from typing_extensions import TypedDict
 
 from deepsimbad.api.localizations import FrameName
 from deepsimbad.api.problems import problems
-from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, Running, Services, StrictRoute
+from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, RunningServices, Services, StrictRoute
 from deepsimbad.core.map import Map
 from deepsimbad.core.rehearsal import WITHIN_M, worst_stretches
 
@@ -60,19 +60,19 @@ class CoverageAnswer(TypedDict):
 
 
 @router.get("/{domain}/coverage", response_model=CoverageAnswer, responses=problems(404, 409, 410, 422))
-async def get_coverage(domain: DomainName, running: Running, map_version: PinnedVersion = None) -> Response:
+async def get_coverage(domain: DomainName, services: RunningServices, map_version: PinnedVersion = None) -> Response:
     """For every map image the chance that a single view there is placed rightly; worst stretches first."""
-    snapshot = await _snapshot(running, domain, map_version)
-    record = await run_sync(running.catalog.map, domain, snapshot.version)
-    n_bytes = await run_sync(running.pictures.n_bytes, domain)
-    _, body = await running.render_json(snapshot.n_images, render_coverage, snapshot, record.metrics, n_bytes)
+    snapshot = await _snapshot(services, domain, map_version)
+    record = await run_sync(services.catalog.map, domain, snapshot.version)
+    n_bytes = await run_sync(services.pictures.n_bytes, domain)
+    _, body = await services.render_json(snapshot.n_images, render_coverage, snapshot, record.metrics, n_bytes)
     return Response(body, media_type=JSON)
 
 
-async def _snapshot(running: Services, domain: str, version: int | None) -> Map:
+async def _snapshot(services: Services, domain: str, version: int | None) -> Map:
     if version is None:
-        return (await running.active(domain)).snapshot
-    return await run_sync(running.maps.snapshot, domain, version)
+        return (await services.active(domain)).snapshot
+    return await run_sync(services.maps.snapshot, domain, version)
 
 
 def render_coverage(snapshot: Map, metrics: Mapping[str, Any], thumbnail_bytes: int) -> CoverageAnswer:
@@ -115,9 +115,9 @@ def render_coverage(snapshot: Map, metrics: Mapping[str, Any], thumbnail_bytes: 
 def _finite_column(values: NDArray[np.floating] | None, digits: int) -> Metres:
     if values is None or not np.isfinite(values).any():
         return None
-    rounded = values.astype(np.float64).round(digits).astype(object)
-    rounded[~np.isfinite(values)] = None
-    column: list[float | None] = rounded.tolist()
+    cells = values.astype(np.float64).round(digits).astype(object)
+    cells[~np.isfinite(values)] = None
+    column: list[float | None] = cells.tolist()
     return column
 
 
@@ -134,11 +134,11 @@ class LandmarksAnswer(TypedDict):
 
 
 @router.get("/{domain}/landmarks", response_model=LandmarksAnswer, responses=problems(404, 409, 410, 422))
-async def get_landmarks(domain: DomainName, running: Running, map_version: PinnedVersion = None) -> Response:
+async def get_landmarks(domain: DomainName, services: RunningServices, map_version: PinnedVersion = None) -> Response:
     """A map's landmarks: the frames they began as, and how many map images list each."""
-    snapshot = await _snapshot(running, domain, map_version)
-    n_bytes = await run_sync(running.pictures.n_bytes, domain)
-    _, body = await running.render_json(snapshot.n_landmarks, render_landmarks, snapshot, n_bytes)
+    snapshot = await _snapshot(services, domain, map_version)
+    n_bytes = await run_sync(services.pictures.n_bytes, domain)
+    _, body = await services.render_json(snapshot.n_landmarks, render_landmarks, snapshot, n_bytes)
     return Response(body, media_type=JSON)
 
 
@@ -177,12 +177,12 @@ _PICTURE: dict[int | str, dict[str, Any]] = {
 async def get_landmark_thumbnail(
     domain: DomainName,
     index: Annotated[int, PathParameter(ge=0, le=GREATEST_ID, description="The landmark's number, from 0.")],
-    running: Running,
+    services: RunningServices,
     map_version: PinnedVersion = None,
 ) -> Response:
     """A small picture of the frame that a landmark began as, where the domain keeps them (`thumbnails`)."""
-    snapshot = await _snapshot(running, domain, map_version)
-    content = await run_sync(running.pictures.of_frame, snapshot, snapshot.landmark_digest, index)
+    snapshot = await _snapshot(services, domain, map_version)
+    content = await run_sync(services.pictures.of_frame, snapshot, snapshot.landmark_digest, index)
     return Response(content, media_type="image/jpeg")
 
 
@@ -190,10 +190,10 @@ async def get_landmark_thumbnail(
 async def get_thumbnail(
     domain: DomainName,
     index: Annotated[int, PathParameter(ge=0, le=GREATEST_ID, description="In route order, from 0.")],
-    running: Running,
+    services: RunningServices,
     map_version: PinnedVersion = None,
 ) -> Response:
     """A small picture of a map image, where the domain keeps them (`thumbnails`)."""
-    snapshot = await _snapshot(running, domain, map_version)
-    content = await run_sync(running.pictures.of_frame, snapshot, snapshot.frame_digest, index)
+    snapshot = await _snapshot(services, domain, map_version)
+    content = await run_sync(services.pictures.of_frame, snapshot, snapshot.frame_digest, index)
     return Response(content, media_type="image/jpeg")

@@ -21,14 +21,14 @@ from deepsimbad.api.requests import (
     JsonBody,
     Next,
     Page,
-    Running,
+    RunningServices,
     StrictRoute,
     names,
     page_of,
     read_json,
 )
 from deepsimbad.core.map import DEFAULT_ACTIONS_M, MOST_ACTION_M, check_actions
-from deepsimbad.engine.maps import Maps, no_active_map
+from deepsimbad.engine.maps import Maps, no_active_map_error
 from deepsimbad.engine.worker import EvaluatorPool, ready
 from deepsimbad.errors import (
     DeepSimbadError,
@@ -186,26 +186,26 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
 
 
 @router.get("", responses=problems(422))
-async def list_domains(request: Request, running: Running, page: DomainPage) -> DomainList:
+async def list_domains(request: Request, services: RunningServices, page: DomainPage) -> DomainList:
     """All domains, by name, a thousand an answer; of cold ones the maps are read."""
     key_domains = request.scope["state"].get("domains")  # to this key; None: all
 
     def describe_page() -> DomainList:
-        answers, domain_page = [], running.catalog.domain_page(page.key, page.limit)
+        answers, domain_page = [], services.catalog.domain_page(page.key, page.limit)
         for record in domain_page.records:
             if key_domains is not None and record.name not in key_domains:
                 continue
             with suppress(UnknownDomainError):  # deleted since it was listed
-                answers.append(describe_domain(record, running.evaluators, running.maps))
+                answers.append(describe_domain(record, services.evaluators, services.maps))
         return DomainList(domains=answers, next=page.next(domain_page.last_key))
 
     return await run_sync(describe_page)
 
 
 @router.get("/{domain}", responses=problems(404, 422))
-async def get_domain(domain: DomainName, running: Running) -> DomainAnswer:
+async def get_domain(domain: DomainName, services: RunningServices) -> DomainAnswer:
     """One domain and its active map."""
-    return await run_sync(lambda: describe_domain(running.catalog.domain(domain), running.evaluators, running.maps))
+    return await run_sync(lambda: describe_domain(services.catalog.domain(domain), services.evaluators, services.maps))
 
 
 @router.get(
@@ -226,7 +226,7 @@ async def get_domain(domain: DomainName, running: Running) -> DomainAnswer:
 async def get_landmark_model(
     domain: DomainName,
     request: Request,
-    running: Running,
+    services: RunningServices,
     map_version: Annotated[
         int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")
     ] = None,
@@ -238,14 +238,14 @@ async def get_landmark_model(
 
     def pack() -> tuple[str, bytes | None]:
         if map_version is None:
-            snapshot = running.maps.active(domain).snapshot
+            snapshot = services.maps.active(domain).snapshot
         else:
-            snapshot = running.maps.snapshot(domain, map_version)
+            snapshot = services.maps.snapshot(domain, map_version)
         etag = f'"{snapshot.landmark_model_digest}"'
         is_known = names(request.headers.get("if-none-match"), etag)
         return etag, None if is_known else snapshot.portable_landmarks()
 
-    etag, content = await run_sync(pack, limiter=running.long_work)
+    etag, content = await run_sync(pack, limiter=services.long_work)
     headers = {**REVALIDATE, "ETag": etag}
     if content is None:
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
@@ -258,7 +258,9 @@ async def get_landmark_model(
     responses={200: {"model": DomainAnswer, "description": "It was there already"}, **problems(409, 413, 415, 422)},
     openapi_extra=declare_json(DomainBody),
 )
-async def put_domain(domain: DomainName, request: Request, response: Response, running: Running) -> DomainAnswer:
+async def put_domain(
+    domain: DomainName, request: Request, response: Response, services: RunningServices
+) -> DomainAnswer:
     """Make a domain; the same again changes nothing, a different one is a 409, but for what may be changed."""
     body = await read_json(request, DomainBody)
     evaluator = evaluator_config(body.evaluator)
@@ -266,53 +268,53 @@ async def put_domain(domain: DomainName, request: Request, response: Response, r
     def make() -> tuple[DomainAnswer, bool]:
         nonlocal evaluator
         try:
-            stored_config = running.catalog.domain(domain).evaluator
+            stored_config = services.catalog.domain(domain).evaluator
         except UnknownDomainError:
-            running.evaluators.evaluator(evaluator.as_dict()).load()  # one that cannot be loaded should not be stored
+            services.evaluators.evaluator(evaluator.as_dict()).load()  # one that cannot be loaded should not be stored
         else:
             if (
                 stored_config.get("kind") == body.evaluator["kind"]
             ):  # what was left out is as it is, whatever the default now
                 evaluator = evaluator_config({**stored_config, **body.evaluator})
-        record, created = running.catalog.create_domain(
-            domain, dict(evaluator.as_dict()), body.closed, body.actions_m, running.settings.max_domains
+        record, is_new = services.catalog.create_domain(
+            domain, dict(evaluator.as_dict()), body.closed, body.actions_m, services.settings.max_domains
         )
         if (options := body.options()) and {**record.options, **options} != record.options:
-            record = running.catalog.set_options(domain, options)
-        return describe_domain(record, running.evaluators, running.maps), created
+            record = services.catalog.set_options(domain, options)
+        return describe_domain(record, services.evaluators, services.maps), is_new
 
-    answer, created = await run_sync(make)
-    response.status_code = 201 if created else 200
-    if created:
+    answer, is_new = await run_sync(make)
+    response.status_code = 201 if is_new else 200
+    if is_new:
         log.info("domain made", extra={"domain": domain})
     return answer
 
 
 @admin.post("/{domain}/warm", status_code=202, response_class=Response, responses=problems(404, 409, 422))
-async def post_warm(domain: DomainName, running: Running, later: BackgroundTasks) -> Response:
+async def post_warm(domain: DomainName, services: RunningServices, later: BackgroundTasks) -> Response:
     """Say that a domain will soon be asked: its map and its evaluator are loaded behind this answer."""
-    record = await run_sync(running.catalog.domain, domain)
+    record = await run_sync(services.catalog.domain, domain)
     if record.active_version is None:
-        raise no_active_map(domain)
+        raise no_active_map_error(domain)
 
     def load() -> None:
         with suppress(DeepSimbadError):  # who asks is told, and so is the log
-            running.maps.active(domain)
-            ready(running.evaluators.evaluator(record.evaluator))
+            services.maps.active(domain)
+            ready(services.evaluators.evaluator(record.evaluator))
 
     later.add_task(load)
     return Response(status_code=HTTPStatus.ACCEPTED, background=later)
 
 
 @admin.delete("/{domain}", status_code=204, responses=problems(404, 409, 422))
-async def delete_domain(domain: DomainName, running: Running) -> None:
+async def delete_domain(domain: DomainName, services: RunningServices) -> None:
     """Remove a domain with its traverses and maps, and end its sessions; a job that still works on it is a 409."""
-    await run_sync(running.open_traverses.forget, domain)
+    await run_sync(services.open_traverses.forget, domain)
     try:
-        await run_sync(running.catalog.delete_domain, domain)
+        await run_sync(services.catalog.delete_domain, domain)
     finally:  # where only its folder could not be removed, the domain is gone all the same
-        if domain not in await run_sync(running.catalog.domain_names):
-            running.maps.forget(domain)
-            await running.sessions.end_those(lambda session: session.domain == domain)
-            running.metrics.forget_domain(domain)
+        if domain not in await run_sync(services.catalog.domain_names):
+            services.maps.forget(domain)
+            await services.sessions.end_those(lambda session: session.domain == domain)
+            services.metrics.forget_domain(domain)
     log.info("domain deleted", extra={"domain": domain})

@@ -194,10 +194,10 @@ class _Request:
     def check_size(self) -> None:
         """Refuse a body that is too large, or for which there is no room, by what the head declares."""
         headers = self._headers
-        declared = headers.get(b"content-length", b"0").strip()
-        if not declared.isdigit() or len(declared) > _LONGEST_LENGTH:
+        length_text = headers.get(b"content-length", b"0").strip()
+        if not length_text.isdigit() or len(length_text) > _LONGEST_LENGTH:
             raise InvalidInputError("Content-Length is not a number")
-        n_declared, is_chunked = int(declared), b"transfer-encoding" in headers
+        n_declared, is_chunked = int(length_text), b"transfer-encoding" in headers
         if is_chunked and b"content-length" in headers:  # whoever stands between us may have taken the other one
             self._own_headers[b"connection"] = b"close"
             raise UnreadableRequestError("the body has both a Content-Length and a Transfer-Encoding")

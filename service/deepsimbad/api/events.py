@@ -9,7 +9,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from deepsimbad.api.jobs import room_for_a_stream
 from deepsimbad.api.problems import problems
-from deepsimbad.api.requests import GREATEST_ID, Running, SessionId, StrictRoute, key_id_of, robot_of
+from deepsimbad.api.requests import GREATEST_ID, RunningServices, SessionId, StrictRoute, key_id_of, robot_of
 from deepsimbad.api.sessions import SessionAnswer, render_observation, render_session
 from deepsimbad.engine.session import SessionView
 from deepsimbad.engine.worker import Stopwatch
@@ -18,14 +18,16 @@ from deepsimbad.store.sessions import SessionRecord
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"], route_class=StrictRoute)
 
 
-async def _session(session_id: SessionId, request: Request, running: Running) -> SessionRecord:
+async def _session(session_id: SessionId, request: Request, services: RunningServices) -> SessionRecord:
     """The session of the path, so that an unknown one is refused before a stream begins."""
-    return await run_sync(running.session_events.find, session_id, robot_of(request))
+    return await run_sync(services.session_events.find, session_id, robot_of(request))
 
 
-async def _followable_session(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> SessionRecord:
+async def _followable_session(
+    session: Annotated[SessionRecord, Depends(_session)], services: RunningServices
+) -> SessionRecord:
     """The session of the path, so that one whose map is no more is refused before a stream begins."""
-    await run_sync(running.sessions.engine_of, session)
+    await run_sync(services.sessions.engine_of, session)
     return session
 
 
@@ -49,7 +51,7 @@ def _observation_answer(view: SessionView) -> SessionAnswer:
 async def get_session_events(
     session: Annotated[SessionRecord, Depends(_followable_session)],
     request: Request,
-    running: Running,
+    services: RunningServices,
     after_sequence: Annotated[
         int | None,
         Query(
@@ -70,8 +72,8 @@ async def get_session_events(
     """
     last_sequence = int(last_event_id) if last_event_id is not None else after_sequence
     key_id = key_id_of(request)
-    async for event in running.session_events.follow(session, last_sequence):
-        if running.stopping.is_set() or not running.keys.still_opens(key_id):
+    async for event in services.session_events.follow(session, last_sequence):
+        if services.stopping.is_set() or not services.keys.still_opens(key_id):
             return
         if event is None:
             continue
@@ -90,7 +92,7 @@ async def get_session_events(
         **problems(404, 410, 422),
     },
 )
-async def get_view(session: Annotated[SessionRecord, Depends(_session)], running: Running) -> Response:
+async def get_view(session: Annotated[SessionRecord, Depends(_session)], services: RunningServices) -> Response:
     """What the robot saw last, as a small picture; held in memory alone, for people who look on."""
-    content = await run_sync(running.pictures.view, session.session_id)
+    content = await run_sync(services.pictures.view, session.session_id)
     return Response(status_code=204) if content is None else Response(content, media_type="image/jpeg")

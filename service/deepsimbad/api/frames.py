@@ -20,7 +20,7 @@ from deepsimbad.api.requests import (
     Answer,
     DomainName,
     JsonBody,
-    Running,
+    RunningServices,
     Services,
     StrictRoute,
     media_type_of,
@@ -112,7 +112,7 @@ async def put_frame(
     position_m: Annotated[float, _metres("Metres along the route.")],
     request: Request,
     response: Response,
-    running: Running,
+    services: RunningServices,
     timestamp_us: Annotated[
         int | None, Query(ge=0, le=GREATEST_EXACT_INTEGER, description="Microseconds since 1970.")
     ] = None,
@@ -133,9 +133,9 @@ async def put_frame(
     not kept; where the domain's evaluator is fitted to images it waits in the traverse's spool until a map is made of
     that. Positions that go backwards are accepted here and refused by the remap.
     """
-    record = await run_sync(running.catalog.domain, domain)
-    evaluator = running.evaluators.evaluator(record.evaluator)
-    levels = await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
+    record = await run_sync(services.catalog.domain, domain)
+    evaluator = services.evaluators.evaluator(record.evaluator)
+    levels = await run_sync(_levels_of, services, domain, name)  # an unknown traverse should not cost an upload
     media_type = media_type_of(request, FRAME_TYPES)
     if media_type == JSON and camera is not None:
         raise InvalidInputError("camera is what took a picture, and the body is an encoding: leave it out")
@@ -144,9 +144,9 @@ async def put_frame(
     columns: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
     columns |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
 
-    def store(encodings: NDArray[np.float32], spooled: bytes | None = None, **facts: Any) -> tuple[bool, int]:
-        pictures = {} if spooled is None else {index: spooled}
-        with running.open_traverses.lend(domain, name) as traverse:
+    def store(encodings: NDArray[np.float32], picture_bytes: bytes | None = None, **facts: Any) -> tuple[bool, int]:
+        pictures = {} if picture_bytes is None else {index: picture_bytes}
+        with services.open_traverses.lend(domain, name) as traverse:
             n_new, _ = traverse.put_frames(Drive(**columns, encodings=encodings, **facts), replace, pictures)
             return n_new == 1, traverse.n_frames
 
@@ -155,9 +155,9 @@ async def put_frame(
         if picture is not None:
             if record.options.get("thumbnails"):
                 digest = content_digest(np.ascontiguousarray(encoded_image.values, "<f4").tobytes())
-                running.pictures.keep(domain, [(digest, picture.body)])
+                services.pictures.keep(domain, [(digest, picture.body)])
             facts = {
-                "spooled": picture.body if evaluator.fitting is Fitting.IMAGES else None,
+                "picture_bytes": picture.body if evaluator.fitting is Fitting.IMAGES else None,
                 "camera": None if picture.size is None else Camera(*picture.size, camera),
                 "grey_levels": None if picture.is_blank else picture.levels,
             }
@@ -172,29 +172,29 @@ async def put_frame(
     async def store_view(document: dict[str, Any], levels: GreyLevels | None) -> tuple[bool, int]:
         picture: Decoded | None
         if media_type in MEDIA_TYPES:
-            picture = await running.decoders.decoded(body, evaluator, Priority.BATCH, levels)
+            picture = await services.decoders.decoded(body, evaluator, Priority.BATCH, levels)
             scene = Scene(image=picture.image)
         else:
-            scene, picture = await scene_in(body, media_type, document, running, evaluator, Priority.BATCH, levels)
+            scene, picture = await scene_in(body, media_type, document, services, evaluator, Priority.BATCH, levels)
         check_whole(evaluator, scene)
-        encoded_image = await encoded(running.worker, evaluator, scene, Priority.BATCH)
+        encoded_image = await encoded(services.worker, evaluator, scene, Priority.BATCH)
         return await run_sync(store_scene, encoded_image, scene.is_blank, picture)
 
-    frame = await parse_json(body, FrameBody, running) if media_type == JSON else FrameBody()
+    frame = await parse_json(body, FrameBody, services) if media_type == JSON else FrameBody()
     if "encoding" in frame.model_fields_set and len(frame.model_fields_set) == 1:
         values = np.array(frame.encoding, np.float64)
-        created, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
+        is_new, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
     elif media_type == JSON and not (frame.model_fields_set and frame.model_fields_set <= SCENE_MEMBERS):
         raise invalid_body("give encoding; or objects, text, or both")
     else:
         members = frame.model_dump(include=set(SCENE_MEMBERS))
         if evaluator.fitting is Fitting.IMAGES:
-            await run_sync(running.spools.make_room, domain, len(body))
+            await run_sync(services.spools.make_room, domain, len(body))
         try:
-            created, n_frames = await store_view(members, levels)
+            is_new, n_frames = await store_view(members, levels)
         except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay
-            created, n_frames = await store_view(members, await run_sync(_levels_of, running, domain, name))
-    response.status_code = 201 if created else 200
+            is_new, n_frames = await store_view(members, await run_sync(_levels_of, services, domain, name))
+    response.status_code = 201 if is_new else 200
     return FrameAnswer(index=index, n_frames=n_frames)
 
 
@@ -212,17 +212,17 @@ async def put_frame(
         **problems(404, 422),
     },
 )
-async def get_frames(domain: DomainName, name: TraverseName, running: Running) -> Response:
+async def get_frames(domain: DomainName, name: TraverseName, services: RunningServices) -> Response:
     """The places, times and digests of all frames of a traverse, by which a drive is compared before it is sent."""
-    await run_sync(running.catalog.domain, domain)
+    await run_sync(services.catalog.domain, domain)
 
     def pack() -> bytes:
-        with running.open_traverses.lend(domain, name) as traverse:
+        with services.open_traverses.lend(domain, name) as traverse:
             content = BytesIO()
             np.savez(content, **traverse.identities())  # type: ignore[arg-type]
             return content.getvalue()
 
-    return Response(await run_sync(pack, limiter=running.batches), media_type=BINARY)
+    return Response(await run_sync(pack, limiter=services.batches), media_type=BINARY)
 
 
 @router.post(
@@ -241,23 +241,23 @@ async def get_frames(domain: DomainName, name: TraverseName, running: Running) -
     ),
 )
 async def post_frames(
-    domain: DomainName, name: TraverseName, request: Request, running: Running, replace: Replace = True
+    domain: DomainName, name: TraverseName, request: Request, services: RunningServices, replace: Replace = True
 ) -> BatchAnswer:
     """Store a batch of frames whose encodings are known, all or none; the same indices again replace them."""
-    await run_sync(running.catalog.domain, domain)
-    await run_sync(_levels_of, running, domain, name)  # an unknown traverse should not cost an upload
+    await run_sync(services.catalog.domain, domain)
+    await run_sync(_levels_of, services, domain, name)  # an unknown traverse should not cost an upload
     media_type_of(request, (BINARY,))
-    max_bytes = running.settings.max_batch_bytes
+    max_bytes = services.settings.max_batch_bytes
 
     def store(spool: IO[bytes]) -> BatchAnswer:
         frames = read_batch(spool, max_bytes)
         encodings = ready_encodings(frames.encodings)
-        with running.open_traverses.lend(domain, name) as traverse:
+        with services.open_traverses.lend(domain, name) as traverse:
             n_new, n_replaced = traverse.put_frames(dataclasses.replace(frames, encodings=encodings), replace)
             return BatchAnswer(n_new=n_new, n_replaced=n_replaced, n_frames=traverse.n_frames)
 
-    data_dir = running.settings.data_dir  # the system's folder for such files is often memory
-    with running.uploads.slot(), storage_faults(data_dir), tempfile.TemporaryFile(dir=data_dir) as spool:
+    data_dir = services.settings.data_dir  # the system's folder for such files is often memory
+    with services.uploads.slot(), storage_faults(data_dir), tempfile.TemporaryFile(dir=data_dir) as spool:
         chunk = bytearray()
         async for piece in request.stream():
             chunk += piece
@@ -267,9 +267,9 @@ async def post_frames(
         await run_sync(spool.write, chunk)
         if spool.tell() == 0:
             raise EmptyBodyError("the body is empty: send an npz file (numpy.savez)")
-        return await run_sync(store, spool, limiter=running.batches)
+        return await run_sync(store, spool, limiter=services.batches)
 
 
-def _levels_of(running: Services, domain: str, name: str) -> GreyLevels | None:
-    with running.open_traverses.lend(domain, name) as traverse:
+def _levels_of(services: Services, domain: str, name: str) -> GreyLevels | None:
+    with services.open_traverses.lend(domain, name) as traverse:
         return traverse.grey_levels

@@ -25,7 +25,7 @@ from deepsimbad.api.requests import (
     Next,
     OfDomain,
     Page,
-    Running,
+    RunningServices,
     StrictRoute,
     id_under_key,
     key_id_of,
@@ -165,7 +165,11 @@ class JobList(Answer):
     openapi_extra=declare_json(RemapBody),
 )
 async def post_remap(
-    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfCreation = None
+    domain: DomainName,
+    request: Request,
+    response: Response,
+    services: RunningServices,
+    idempotency_key: KeyOfCreation = None,
 ) -> JobAnswer:
     """Build the next map of a domain as a job; what serves stays until the new map is sealed.
 
@@ -179,27 +183,27 @@ async def post_remap(
     job_id = id_under_key(request, REMAP, domain, idempotency_key)
 
     def submit() -> JobAnswer:
-        earlier_job = running.runner.earlier_job(job_id, config)
+        earlier_job = services.runner.earlier_job(job_id, config)
         if earlier_job is not None:
             return JobAnswer.model_validate(earlier_job)
-        record = running.catalog.domain(domain)
+        record = services.catalog.domain(domain)
         if config.camera_of is not None:
-            camera_domain(running.catalog, config.camera_of, record)
+            camera_domain(services.catalog, config.camera_of, record)
         n_frames: dict[str, int] = {}
         for name in (getattr(config, role) for role in TRAVERSE_ROLES):
             if name is not None:
-                with Traverse.open(running.settings.data_dir, domain, name) as traverse:
+                with Traverse.open(services.settings.data_dir, domain, name) as traverse:
                     n_frames[name] = traverse.n_frames
         if config.append and record.active_version is None:
             raise NoActiveMapError(
                 f"domain {domain} has no active map to append to: make one first, without append", domain=domain
             )
         if config.append and record.active_version is not None:
-            refuse_known_traverse(running.catalog.map(domain, record.active_version), config.training_traverse)
+            refuse_known_traverse(services.catalog.map(domain, record.active_version), config.training_traverse)
         with suppress(NoActiveMapError, UnavailableError):  # a damaged one keeps nobody from making another
-            snapshot = None if record.active_version is None else running.maps.active(domain).snapshot
+            snapshot = None if record.active_version is None else services.maps.active(domain).snapshot
             refuse_impossible(config, n_frames, snapshot)
-        return JobAnswer.model_validate(running.runner.submit(domain, config, job_id))
+        return JobAnswer.model_validate(services.runner.submit(domain, config, job_id))
 
     job = await run_sync(submit)
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
@@ -213,7 +217,11 @@ async def post_remap(
     openapi_extra=declare_json(ExperienceBody),
 )
 async def post_experience(
-    domain: DomainName, request: Request, response: Response, running: Running, idempotency_key: KeyOfCreation = None
+    domain: DomainName,
+    request: Request,
+    response: Response,
+    services: RunningServices,
+    idempotency_key: KeyOfCreation = None,
 ) -> JobAnswer:
     """Let the next map version learn from a session, whose true positions are known by now, as a job.
 
@@ -226,38 +234,40 @@ async def post_experience(
 
     async def learn() -> JobRecord:
         truths = (domain, body.session_id, body.true_positions_m, time.time())
-        before_m = await run_sync(keep_true_positions, running.session_store, running.catalog, *truths)
+        before_m = await run_sync(keep_true_positions, services.session_store, services.catalog, *truths)
         try:
-            return await run_sync(running.runner.submit, domain, config, job_id)
+            return await run_sync(services.runner.submit, domain, config, job_id)
         finally:  # what was kept counts now or never, though the job be refused
             try:
-                ranking = await running.truths.rank(body.session_id, body.true_positions_m)
-                await run_sync(running.metrics.fed_back, domain, ranking.new_since(before_m).tolist())
+                ranking = await services.truths.rank(body.session_id, body.true_positions_m)
+                await run_sync(services.metrics.fed_back, domain, ranking.new_since(before_m).tolist())
             except DeepSimbadError as error:  # the job is on its way all the same
                 labels = {"domain": domain, "session_id": body.session_id}
                 log.warning("truths could not be ranked: %s", error, extra=labels)
 
-    job = await run_sync(running.runner.earlier_job, job_id, config) or await learn()
+    job = await run_sync(services.runner.earlier_job, job_id, config) or await learn()
     response.headers["Location"] = f"/v1/admin/jobs/{job.job_id}"
     return JobAnswer.model_validate(job)
 
 
-async def _job(job_id: JobId, running: Running) -> JobRecord:
+async def _job(job_id: JobId, services: RunningServices) -> JobRecord:
     """The job of the path, so that an unknown one is refused before a stream begins."""
-    return await run_sync(running.catalog.job, job_id)
+    return await run_sync(services.catalog.job, job_id)
 
 
-async def room_for_a_stream(running: Running) -> AsyncIterator[None]:
+async def room_for_a_stream(services: RunningServices) -> AsyncIterator[None]:
     """Room for one more stream, until it ends."""
-    with running.event_streams.slot():
+    with services.event_streams.slot():
         yield
 
 
 @router.get("", responses=problems(404, 422))
-async def list_jobs(running: Running, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None) -> JobList:
+async def list_jobs(
+    services: RunningServices, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None
+) -> JobList:
     """Jobs, newest first."""
-    newest = await run_sync(running.newest_jobs, domain, page.number, page.limit)
-    return JobList.model_validate({"jobs": newest.records, "next": page.next(newest.last_key)})
+    job_page = await run_sync(services.newest_jobs, domain, page.number, page.limit)
+    return JobList.model_validate({"jobs": job_page.records, "next": page.next(job_page.last_key)})
 
 
 @router.get("/{job_id}", responses=problems(404, 422))
@@ -276,7 +286,7 @@ async def get_job(job: Annotated[JobRecord, Depends(_job)]) -> JobAnswer:
     },
 )
 async def get_job_events(
-    job: Annotated[JobRecord, Depends(_job)], request: Request, running: Running
+    job: Annotated[JobRecord, Depends(_job)], request: Request, services: RunningServices
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow a job: server-sent events, each holding the job as JSON; the last one is named `done`.
 
@@ -284,7 +294,7 @@ async def get_job_events(
     """
     last_job: JobRecord | None = None
     key_id = key_id_of(request)
-    while not running.stopping.is_set() and running.keys.still_opens(key_id):
+    while not services.stopping.is_set() and services.keys.still_opens(key_id):
         if job != last_job:
             last_job = job
             yield ServerSentEvent(
@@ -292,14 +302,14 @@ async def get_job_events(
             )
         if job.state.is_final:
             return
-        await asyncio.sleep(running.settings.event_poll_s)
+        await asyncio.sleep(services.settings.event_poll_s)
         try:
-            job = await run_sync(running.catalog.job, job.job_id)
+            job = await run_sync(services.catalog.job, job.job_id)
         except UnknownJobError:  # its domain was deleted
             return
 
 
 @router.delete("/{job_id}", status_code=204, responses=problems(404, 422))
-async def cancel_job(job_id: JobId, running: Running) -> None:
+async def cancel_job(job_id: JobId, services: RunningServices) -> None:
     """Ask a job to stop; one that has ended stays as it is."""
-    await run_sync(running.runner.cancel, job_id)
+    await run_sync(services.runner.cancel, job_id)

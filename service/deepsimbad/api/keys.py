@@ -91,9 +91,9 @@ class KeyRing:
         record = self.by_id.get(key_id)
         return record is not None and record.is_usable(current_moment())
 
-    def holder(self, presented: str) -> KeyRecord:
+    def holder(self, key_text: str) -> KeyRecord:
         """The key presented as text; raises UnauthorizedError where it is malformed, unknown, revoked or expired."""
-        key = ApiKey.parse(presented)
+        key = ApiKey.parse(key_text)
         if key is None:
             raise UnauthorizedError(f"the key is malformed: {_KEY_HELP}")
         record = self.by_id.get(key.key_id)

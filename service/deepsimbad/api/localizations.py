@@ -116,8 +116,10 @@ OBSERVATION_TYPES = (*MEDIA_TYPES, JSON, *MADE_ON_BOARD, *SCENE_BODIES)
 def observation_body(extra_members: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The body of an observation in the OpenAPI document; a JSON body has `extra_members` too, by schema."""
     forms = [{**form, "properties": {**form["properties"], **(extra_members or {})}} for form in _FORMS]
-    packed = {RANKS: _RANKS_SCHEMA, UNIT_ENCODING: _UNIT_ENCODING_SCHEMA}
-    return declare({**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, **packed, **SCENE_BODIES})
+    packed_schemas = {RANKS: _RANKS_SCHEMA, UNIT_ENCODING: _UNIT_ENCODING_SCHEMA}
+    return declare(
+        {**dict.fromkeys(MEDIA_TYPES, IMAGE_SCHEMA), JSON: {"oneOf": forms}, **packed_schemas, **SCENE_BODIES}
+    )
 
 
 OBSERVATION_BODY = observation_body()
@@ -244,9 +246,9 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64], is_confident:
     """A recommended move, or to stop where the robot is sure of its place; None where there is none."""
     if plan is None:
         return None
-    unknown = [None] * actions_m.size
-    values = unknown if plan.values is None else plan.values.tolist()
-    bits = unknown if plan.bits is None else plan.bits.tolist()
+    nulls = [None] * actions_m.size
+    values = nulls if plan.values is None else plan.values.tolist()
+    bits = nulls if plan.bits is None else plan.bits.tolist()
     actions: list[ActionAnswer] = []
     for action_m, value, expected_bits in zip(actions_m.tolist(), values, bits, strict=True):
         actions.append({"action_m": action_m, "q_value": value, "expected_bits": expected_bits})
@@ -316,47 +318,47 @@ async def post_localization(
     With `Accept: application/octet-stream` the answer is the relevance of every map image; with
     `application/geopose+json` the likeliest place on Earth, where the domain has an anchor.
     """
-    watch, running = Stopwatch(), cast("Services", request.app.state.services)
-    active = await running.active(domain)
-    snapshot = active.snapshot
+    watch, services = Stopwatch(), cast("Services", request.app.state.services)
+    mapped_domain = await services.active(domain)
+    snapshot = mapped_domain.snapshot
     media_type = media_type_of(request, OBSERVATION_TYPES)
     shortlist_length(snapshot, shortlist)  # a bad query should not cost an upload
     landmark_models = None if if_match is None else required_tags(if_match)
     body = await read_bytes(request)
     watch.lap("receive")
-    evaluator = running.evaluators.evaluator(active.record.evaluator)
-    view, remarks = await view_in(body, running, media_type, evaluator, snapshot)
+    evaluator = services.evaluators.evaluator(mapped_domain.record.evaluator)
+    view, remarks = await view_in(body, services, media_type, evaluator, snapshot)
     snapshot.check_landmark_model(landmark_models)
     watch.lap("decode")
-    view = await running.encoded(evaluator, view)
+    view = await services.encoded(evaluator, view)
     if prefers(request, BINARY):
 
         def compare() -> NDArray[np.float32]:
             return relevances(snapshot, describe(snapshot, evaluator, view))
 
-        return npy_response(await running.worker.computed(compare, is_short=is_short(snapshot, view)))
+        return npy_response(await services.worker.computed(compare, is_short=is_short(snapshot, view)))
 
     def look() -> Localization:
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         return localize(snapshot, evaluator, view, shortlist, watch)
 
-    localization = await running.worker.computed(look, is_short=is_short(snapshot, view, shortlist))
+    localization = await services.worker.computed(look, is_short=is_short(snapshot, view, shortlist))
     if wants_geopose(request):
-        record = await run_sync(running.catalog.domain, domain)  # as it is now
+        record = await run_sync(services.catalog.domain, domain)  # as it is now
         anchor = record.options.get("anchor")
         mode = int(localization.belief.top[0])
         geopose = render_geopose(snapshot, None if anchor is None else AnchorBody(**anchor), mode)
         return Response(to_json(geopose), media_type=GEOPOSE)
-    answer, body = await running.render_json(
+    answer, body = await services.render_json(
         localization.belief.top.size, render_localization, localization, watch, remarks
     )
-    running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
+    services.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
     return Response(body, media_type=JSON)
 
 
 async def view_in(
     body: bytes,
-    running: Services,
+    services: Services,
     media_type: str,
     evaluator: Evaluator,
     snapshot: Map,
@@ -371,7 +373,7 @@ async def view_in(
     """
     document: dict[str, Any] = {}
     if media_type == JSON:
-        observation = observation or await parse_json(body, ObservationBody, running)
+        observation = observation or await parse_json(body, ObservationBody, services)
         members = observation.model_fields_set & ObservationBody.model_fields.keys()
         is_scene = bool(members) and members <= SCENE_MEMBERS
         if not is_scene and len(members) != 1:
@@ -390,16 +392,16 @@ async def view_in(
     levels = levels_in(snapshot.landmark_model)
     if media_type not in MEDIA_TYPES:
         scene, picture = await scene_in(
-            body, media_type, document, running, evaluator, Priority.LIVE, levels, snapshot.cameras
+            body, media_type, document, services, evaluator, Priority.LIVE, levels, snapshot.cameras
         )
         picture_remarks = [] if picture is None else picture.remarks
         return NothingSeen() if scene.is_blank else scene, [*scene.remarks, *picture_remarks]
-    decoded = await running.decoders.decoded(body, evaluator, Priority.LIVE, levels, snapshot.cameras)
-    return NothingSeen() if decoded.is_blank else decoded.image, decoded.remarks
+    decoded_picture = await services.decoders.decoded(body, evaluator, Priority.LIVE, levels, snapshot.cameras)
+    return NothingSeen() if decoded_picture.is_blank else decoded_picture.image, decoded_picture.remarks
 
 
 def npy_response(values: NDArray[np.floating]) -> Response:
     """An array as a float32 npy file."""
-    packed = BytesIO()
-    np.save(packed, values.astype("<f4", copy=False), allow_pickle=False)
-    return Response(packed.getvalue(), media_type=BINARY)
+    file = BytesIO()
+    np.save(file, values.astype("<f4", copy=False), allow_pickle=False)
+    return Response(file.getvalue(), media_type=BINARY)

@@ -23,13 +23,13 @@ from deepsimbad.api.requests import (
     JsonBody,
     Next,
     Page,
-    Running,
+    RunningServices,
     StrictRoute,
     names,
     page_of,
     read_json,
 )
-from deepsimbad.engine.maps import load_snapshot, unreadable
+from deepsimbad.engine.maps import load_snapshot, unreadable_error
 from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
 from deepsimbad.store.catalog_maps import ANY, removal_error
 from deepsimbad.store.records import MapState
@@ -86,16 +86,16 @@ class MapList(Answer):
 
 
 @router.get("/{domain}/maps", responses=problems(404, 422))
-async def list_maps(domain: DomainName, running: Running, page: Annotated[Page, page_of("maps")]) -> MapList:
+async def list_maps(domain: DomainName, services: RunningServices, page: Annotated[Page, page_of("maps")]) -> MapList:
     """The history of a domain's map, newest version first."""
-    newest = await run_sync(running.catalog.newest_maps, domain, page.number, page.limit)
-    return MapList.model_validate({"maps": newest.records, "next": page.next(newest.last_key)})
+    map_page = await run_sync(services.catalog.newest_maps, domain, page.number, page.limit)
+    return MapList.model_validate({"maps": map_page.records, "next": page.next(map_page.last_key)})
 
 
 @router.put(
     "/{domain}/active-map", responses=problems(404, 409, 410, 413, 415, 422), openapi_extra=declare_json(ActiveMapBody)
 )
-async def put_active_map(domain: DomainName, request: Request, running: Running) -> MapAnswer:
+async def put_active_map(domain: DomainName, request: Request, services: RunningServices) -> MapAnswer:
     """Activate a version, forward or back, if the active one is still `expected`.
 
     The version's file is checked first, so that a damaged one never takes over. One whose file was removed is a 410.
@@ -104,24 +104,24 @@ async def put_active_map(domain: DomainName, request: Request, running: Running)
     expected = body.expected if "expected" in body.model_fields_set else ANY
 
     def switch() -> MapAnswer:
-        if running.catalog.map_anywhere(domain, body.version).state is MapState.BUILDING:
+        if services.catalog.map_anywhere(domain, body.version).state is MapState.BUILDING:
             raise ConflictError(f"map {body.version} of domain {domain} is still being built")
-        load_snapshot(running.catalog, domain, body.version)
-        record = running.catalog.activate(domain, body.version, expected)
-        running.maps.refresh(domain)
-        running.retention.prune(domain)
+        load_snapshot(services.catalog, domain, body.version)
+        record = services.catalog.activate(domain, body.version, expected)
+        services.maps.refresh(domain)
+        services.retention.prune(domain)
         return MapAnswer.model_validate(record)
 
     return await run_sync(switch)  # what switches it logs it too, whoever asked
 
 
 @router.delete("/{domain}/maps/{version}", status_code=204, responses=problems(404, 409, 410, 422))
-async def delete_map(domain: DomainName, version: MapVersion, running: Running) -> None:
+async def delete_map(domain: DomainName, version: MapVersion, services: RunningServices) -> None:
     """Remove the file of a version; it stays in the history, retired.
 
     The version that serves, one being built and one that a session lives on are a 409.
     """
-    await run_sync(running.retention.remove, domain, version)
+    await run_sync(services.retention.remove, domain, version)
     log.info("map removed", extra={"domain": domain, "map_version": version})
 
 
@@ -135,22 +135,24 @@ async def delete_map(domain: DomainName, version: MapVersion, running: Running) 
         **problems(404, 410, 416, 422),
     },
 )
-async def get_map_file(domain: DomainName, version: MapVersion, request: Request, running: Running) -> Response:
+async def get_map_file(
+    domain: DomainName, version: MapVersion, request: Request, services: RunningServices
+) -> Response:
     """A sealed version whole, as one SQLite file that another server can import.
 
     It is read against its digest before the first byte is sent; `Repr-Digest` and `ETag` tell that digest.
     """
 
     def check() -> tuple[Path, str, int]:
-        record = running.catalog.map(domain, version)
+        record = services.catalog.map(domain, version)
         if record.removed_at is not None:
             raise removal_error(domain, version)
         if record.sha256 is None:
             raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
         try:
-            path = running.catalog.map_file(domain, version)
+            path = services.catalog.map_file(domain, version)
         except DamagedMapError as error:
-            raise unreadable(running.catalog, domain, version) from error
+            raise unreadable_error(services.catalog, domain, version) from error
         return path, record.sha256, path.stat().st_size
 
     path, sha256, n_bytes = await run_sync(check)

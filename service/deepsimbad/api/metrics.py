@@ -175,8 +175,10 @@ class StateCollector(Collector):
         try:
             domains, self._jobs = self._catalog.domain_names(), self._catalog.jobs()
             # Nobody could read the series of a hundred thousand domains: those whose maps are in memory have them.
-            damaged = self._maps.damaged()  # asked first: one that is back is in memory then
-            series_domains = {mapped_domain.record.name for mapped_domain in self._maps.loaded()} | damaged.keys()
+            damaged_versions = self._maps.damaged()  # asked first: one that is back is in memory then
+            series_domains = {
+                mapped_domain.record.name for mapped_domain in self._maps.loaded()
+            } | damaged_versions.keys()
             self._serving = self._catalog.serving_maps(series_domains & domains)
         except DeepSimbadError:  # `deepsimbad_ready` tells; what needs no catalog is shown all the same
             self._n_domains = None
@@ -203,12 +205,12 @@ class StateCollector(Collector):
             yield from self._of_jobs()
 
     def _of_maps(self) -> Iterator[GaugeMetricFamily]:
-        serving, damaged = self._serving.items(), self._maps.damaged()
-        versions = {(domain,): record.version for domain, record in serving}
+        serving_maps, damaged_versions = self._serving.items(), self._maps.damaged()
+        versions = {(domain,): record.version for domain, record in serving_maps}
         yield _gauge("active_map_version", "Version of the map that serves.", versions, "domain")
-        ages_s = {(domain,): max(0.0, time.time() - _seconds(record.created_at)) for domain, record in serving}
+        ages_s = {(domain,): max(0.0, time.time() - _seconds(record.created_at)) for domain, record in serving_maps}
         yield _gauge("map_age_seconds", "Time since the map that serves was built.", ages_s, "domain")
-        is_damaged = {(domain,): damaged.get(domain) == record.version for domain, record in serving}
+        is_damaged = {(domain,): damaged_versions.get(domain) == record.version for domain, record in serving_maps}
         yield _gauge("map_damaged", "1 where the map that serves could not be loaded.", is_damaged, "domain")
         snapshots = {(mapped_domain.snapshot.domain,): mapped_domain.snapshot for mapped_domain in self._maps.loaded()}
         n_images = {domain: snapshot.route.n_images for domain, snapshot in snapshots.items()}

@@ -302,8 +302,8 @@ def declare_json(model: type[BaseModel]) -> dict[str, Any]:
 
 def declare(content: dict[str, Any]) -> dict[str, Any]:
     """The OpenAPI request body with these media types and schemas, as `openapi_extra`."""
-    described = {media_type: {"schema": schema} for media_type, schema in content.items()}
-    return {"requestBody": {"required": True, "content": described}}
+    content_schemas = {media_type: {"schema": schema} for media_type, schema in content.items()}
+    return {"requestBody": {"required": True, "content": content_schemas}}
 
 
 def install_openapi(app: FastAPI, root_path: str) -> None:
@@ -380,11 +380,11 @@ def _link(operations: Mapping[str, dict[str, Any]]) -> None:
 
 
 def _problem(status: int) -> dict[str, Any]:
-    declared: dict[str, Any] = {
+    response: dict[str, Any] = {
         "description": _DESCRIPTIONS[status],
         "content": {MEDIA_TYPE: {"schema": {"$ref": _REFERENCE.format(model="Problem")}}},
     }
-    return declared | ({"headers": _HEADERS[status]} if status in _HEADERS else {})
+    return response | ({"headers": _HEADERS[status]} if status in _HEADERS else {})
 
 
 def _write_pairs_plainly(schema: Any) -> None:

@@ -210,9 +210,9 @@ class StrictRoute(APIRoute):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer as the framework does, once the query is known to hold no unknown parameter."""
-        unknown = Request(scope).query_params.keys() - self.queries
-        if unknown and scope["method"] in (self.methods or ()):
-            unknown_names = sorted(name[:_LONGEST_NAME] for name in unknown)
+        unknown_queries = Request(scope).query_params.keys() - self.queries
+        if unknown_queries and scope["method"] in (self.methods or ()):
+            unknown_names = sorted(name[:_LONGEST_NAME] for name in unknown_queries)
             hint = nearest_of(unknown_names[0], self.queries) if self.queries else ": this call takes none"
             raise UnknownParameterError(
                 f"there is no query parameter {unknown_names[0]}{hint}",
@@ -256,7 +256,7 @@ class QuickRoute(StrictRoute):
             await response(scope, receive, send)
 
 
-Running = Annotated[Services, Depends(services_of)]
+RunningServices = Annotated[Services, Depends(services_of)]
 Name = Annotated[
     str, Field(pattern=NAME_PATTERN, description="Letters, digits, `.`, `_`, `-`; at most 64, a letter or digit first.")
 ]
@@ -422,7 +422,7 @@ async def read_json(request: Request, kind: type[Body]) -> Body:
     return await parse_json(await read_bytes(request), kind, request.app.state.services)
 
 
-async def parse_json(body: bytes, kind: type[Body], running: Services) -> Body:
+async def parse_json(body: bytes, kind: type[Body], services: Services) -> Body:
     """Check the bytes of a JSON body, those of a long one in a thread; raises InvalidRequestError."""
     # All but numbers costs the parser a hundred times its bytes, and an error of its own where it is wrong: megabytes
     # of it would take seconds and gigabytes.
@@ -436,7 +436,7 @@ async def parse_json(body: bytes, kind: type[Body], running: Services) -> Body:
     document = body.removeprefix(_BYTE_ORDER_MARK)
     try:
         if len(body) > _LONG_BYTES:
-            return await run_sync(kind.model_validate_json, document, limiter=running.long_work)
+            return await run_sync(kind.model_validate_json, document, limiter=services.long_work)
         return kind.model_validate_json(document)
     except ValidationError as error:
         raise invalid_request(

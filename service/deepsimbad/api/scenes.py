@@ -54,7 +54,7 @@ async def scene_in(
     body: bytes,
     media_type: str,
     document: Mapping[str, Any],
-    running: Services,
+    services: Services,
     evaluator: Evaluator,
     priority: Priority,
     levels: GreyLevels | None,
@@ -77,5 +77,5 @@ async def scene_in(
     scene.check_forms(evaluator.forms)
     if image is None:
         return scene, None
-    decoded = await running.decoders.decoded(image, evaluator, priority, levels, cameras)
-    return scene.with_image(decoded.image), decoded
+    picture = await services.decoders.decoded(image, evaluator, priority, levels, cameras)
+    return scene.with_image(picture.image), picture

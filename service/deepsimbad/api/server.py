@@ -228,5 +228,5 @@ def serve(settings: Settings, create: bool = False) -> None:
         cause = ended.__context__
         if isinstance(cause, OSError):
             raise cannot_listen(settings, cause) from cause
-        unexplained = UnavailableError("the service could not start: the log says why")
-        raise getattr(app.state, "startup_error", unexplained) from ended
+        unknown_error = UnavailableError("the service could not start: the log says why")
+        raise getattr(app.state, "startup_error", unknown_error) from ended

@@ -42,7 +42,7 @@ from deepsimbad.api.requests import (
     OfDomain,
     Page,
     QuickRoute,
-    Running,
+    RunningServices,
     Services,
     SessionId,
     StrictRoute,
@@ -238,10 +238,10 @@ def _iso(seconds: float) -> str:
 
 
 async def _session_response(
-    running: Services, view: SessionView, status: int = 200, location: str | None = None
+    services: Services, view: SessionView, status: int = 200, location: str | None = None
 ) -> Response:
     headers = None if location is None else {"Location": location}
-    _, body = await running.render_json(view.belief.top.size, render_session, view)
+    _, body = await services.render_json(view.belief.top.size, render_session, view)
     return Response(body, status, headers, JSON)
 
 
@@ -256,14 +256,14 @@ async def _session_response(
     openapi_extra=declare_json(SessionBody),
 )
 async def post_session(
-    domain: DomainName, request: Request, running: Running, idempotency_key: KeyOfCreation = None
+    domain: DomainName, request: Request, services: RunningServices, idempotency_key: KeyOfCreation = None
 ) -> Response:
     """Begin a session on the domain's active map, which it keeps whatever is activated later."""
-    active = await running.active(domain)
+    mapped_domain = await services.active(domain)
     config = (await read_json(request, SessionBody)).config()
     session_id = id_under_key(request, "session", domain, idempotency_key)
-    view = await running.sessions.begin(active, config, session_id, key_id_of(request))
-    return await _session_response(running, view, 201, f"/v1/sessions/{view.session_id}")
+    view = await services.sessions.begin(mapped_domain, config, session_id, key_id_of(request))
+    return await _session_response(services, view, 201, f"/v1/sessions/{view.session_id}")
 
 
 @router.post(
@@ -297,7 +297,7 @@ async def post_observation(
     When this has answered, the observation survives whatever happens to the service. Two at once are both answered, in
     order of arrival. The body is what `localizations` takes.
     """
-    watch, running = Stopwatch(), cast("Services", request.app.state.services)
+    watch, services = Stopwatch(), cast("Services", request.app.state.services)
     try:
         media_type = media_type_of(request, OBSERVATION_TYPES)
         body = await read_bytes(request)
@@ -306,36 +306,36 @@ async def post_observation(
         if idempotency_key is not None:
             query = f"{media_type}\n{action_m!r}\n{action_std_m!r}\n".encode()
             idempotency = IdempotencyKey(idempotency_key, hashlib.sha256(query + body).digest())
-        decode = partial(view_in, body, running, media_type)
+        decode = partial(view_in, body, services, media_type)
         landmark_models = None if if_match is None else required_tags(if_match)
         observation = Observation(decode, action_m, action_std_m, shortlist, idempotency, landmark_models)
-        view = await running.sessions.observe(session_id, observation, watch, robot_of(request))
+        view = await services.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
-        running.metrics.observed(error.code)
+        services.metrics.observed(error.code)
         raise
-    if media_type in MEDIA_TYPES and await _keeps_pictures(running, view.snapshot.domain):
-        running.pictures.hold_view(session_id, body)
-    answer, body = await running.render_json(view.belief.top.size, render_observation, view, watch)
+    if media_type in MEDIA_TYPES and await _keeps_pictures(services, view.snapshot.domain):
+        services.pictures.hold_view(session_id, body)
+    answer, body = await services.render_json(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
-    running.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
+    services.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
     return Response(body, media_type=JSON)
 
 
-async def _keeps_pictures(running: Services, domain: str) -> bool:
+async def _keeps_pictures(services: Services, domain: str) -> bool:
     """Whether a domain keeps small pictures; False where it has no map that answers."""
     try:
-        return bool((await running.active(domain)).record.options.get("thumbnails"))
+        return bool((await services.active(domain)).record.options.get("thumbnails"))
     except DeepSimbadError:
         return False
 
 
 @router.get("/sessions/{session_id}", response_model=SessionAnswer, responses=problems(404, 410, 422))
 async def get_session(
-    session_id: SessionId, request: Request, running: Running, shortlist: Shortlist = None
+    session_id: SessionId, request: Request, services: RunningServices, shortlist: Shortlist = None
 ) -> Response:
     """A session as it stands; asking does not keep it from expiring."""
-    return await _session_response(running, await running.sessions.view(session_id, shortlist, robot_of(request)))
+    return await _session_response(services, await services.sessions.view(session_id, shortlist, robot_of(request)))
 
 
 @router.get(
@@ -347,22 +347,24 @@ async def get_session(
     },
 )
 async def get_belief(
-    session_id: SessionId, request: Request, running: Running, shortlist: Shortlist = None
+    session_id: SessionId, request: Request, services: RunningServices, shortlist: Shortlist = None
 ) -> Response:
     """The belief alone; with `Accept: application/octet-stream` the mass of every map image."""
     if prefers(request, BINARY):
-        return npy_response(await running.sessions.mass(session_id, robot_of(request)))
-    view = await running.sessions.view(session_id, shortlist, robot_of(request))
-    _, body = await running.render_json(
+        return npy_response(await services.sessions.mass(session_id, robot_of(request)))
+    view = await services.sessions.view(session_id, shortlist, robot_of(request))
+    _, body = await services.render_json(
         view.belief.top.size, render_belief, view.snapshot, view.belief, view.is_confident
     )
     return Response(body, media_type=JSON)
 
 
 @router.get("/sessions/{session_id}/next-best-view", responses=problems(404, 410, 422))
-async def get_next_best_view(session_id: SessionId, request: Request, running: Running) -> NextBestViewAnswer | None:
+async def get_next_best_view(
+    session_id: SessionId, request: Request, services: RunningServices
+) -> NextBestViewAnswer | None:
     """The move that would tell most, without a new view; null where the map can name none."""
-    view = await running.sessions.view(session_id, key_id=robot_of(request))
+    view = await services.sessions.view(session_id, key_id=robot_of(request))
     return render_plan(view.plan, view.snapshot.actions_m, view.is_confident)
 
 
@@ -372,33 +374,33 @@ async def get_next_best_view(session_id: SessionId, request: Request, running: R
     responses=problems(404, 410, 413, 415, 422),
     openapi_extra=declare_json(PriorBody),
 )
-async def put_prior(session_id: SessionId, request: Request, running: Running) -> Response:
+async def put_prior(session_id: SessionId, request: Request, services: RunningServices) -> Response:
     """Replace the belief by one around a position: the robot was carried, or got a fix."""
     body = await read_json(request, PriorBody)
-    view = await running.sessions.set_prior(session_id, body.position_m, body.std_m, robot_of(request))
-    return await _session_response(running, view)
+    view = await services.sessions.set_prior(session_id, body.position_m, body.std_m, robot_of(request))
+    return await _session_response(services, view)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=problems(404, 410, 422))
-async def delete_session(session_id: SessionId, request: Request, running: Running) -> None:
+async def delete_session(session_id: SessionId, request: Request, services: RunningServices) -> None:
     """End a session; nothing more can be asked of it."""
-    await running.sessions.end(session_id, robot_of(request))
+    await services.sessions.end(session_id, robot_of(request))
 
 
 @router.post(
     "/sessions/{session_id}/truths", responses=problems(404, 410, 413, 415, 422), openapi_extra=declare_json(TruthsBody)
 )
-async def post_truths(session_id: SessionId, request: Request, running: Running) -> TruthsAnswer:
+async def post_truths(session_id: SessionId, request: Request, services: RunningServices) -> TruthsAnswer:
     """Rank the truth in the belief as it was after every observation, and keep the positions to learn from.
 
     The session may have ended, up to a day ago unless the settings say otherwise. The answer's ANR is that of this
     session; the metric `deepsimbad_live_anr_percent` counts every observation once.
     """
     body = await read_json(request, TruthsBody)
-    ranking, before_m = await running.truths.keep(
+    ranking, before_m = await services.truths.keep(
         session_id, body.true_positions_m, body.true_map_images, body.first_observation, robot_of(request)
     )
-    await run_sync(running.metrics.fed_back, ranking.session.domain, ranking.new_since(before_m).tolist())
+    await run_sync(services.metrics.fed_back, ranking.session.domain, ranking.new_since(before_m).tolist())
     ranks = None if ranking.retrieval_rank is None else ranking.retrieval_rank[ranking.first :].tolist()
     return TruthsAnswer(
         n_scored=ranking.n_scored,
@@ -411,10 +413,12 @@ async def post_truths(session_id: SessionId, request: Request, running: Running)
 
 @listing.get("", responses=problems(404, 422))
 async def list_sessions(
-    running: Running, page: Annotated[Page, page_of("sessions")], domain: OfDomain = None
+    services: RunningServices, page: Annotated[Page, page_of("sessions")], domain: OfDomain = None
 ) -> SessionList:
     """Living sessions, newest first; whoever may list them may also ask and end them by their ids."""
     if domain is not None:
-        await run_sync(running.catalog.domain, domain)
-    newest = await running.sessions.newest(domain, page.number, page.limit)
-    return SessionList(sessions=[render_listed(session) for session in newest.records], next=page.next(newest.last_key))
+        await run_sync(services.catalog.domain, domain)
+    session_page = await services.sessions.newest(domain, page.number, page.limit)
+    return SessionList(
+        sessions=[render_listed(session) for session in session_page.records], next=page.next(session_page.last_key)
+    )

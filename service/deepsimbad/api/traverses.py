@@ -18,7 +18,7 @@ from deepsimbad.api.requests import (
     Name,
     Next,
     Page,
-    Running,
+    RunningServices,
     StrictRoute,
     page_of,
     read_json,
@@ -120,38 +120,42 @@ class TraverseList(Answer):
     responses={200: {"model": TraverseAnswer, "description": "It was there already"}, **problems(404, 413, 415, 422)},
     openapi_extra=declare_json(TraverseBody),
 )
-async def post_traverse(domain: DomainName, request: Request, response: Response, running: Running) -> TraverseAnswer:
+async def post_traverse(
+    domain: DomainName, request: Request, response: Response, services: RunningServices
+) -> TraverseAnswer:
     """Make an empty traverse; one of that name that is there stays as it is, but for grey levels it did not know."""
     body = await read_json(request, TraverseBody)
-    data_dir = running.settings.data_dir
+    data_dir = services.settings.data_dir
 
     def make() -> tuple[TraverseAnswer, bool]:
-        running.catalog.domain(domain)
+        services.catalog.domain(domain)
         try:
-            traverse, created = Traverse.create(data_dir, domain, body.name), True
+            traverse, is_new = Traverse.create(data_dir, domain, body.name), True
         except ConflictError:
-            traverse, created = Traverse.open(data_dir, domain, body.name), False
+            traverse, is_new = Traverse.open(data_dir, domain, body.name), False
         with traverse:
             if body.grey_levels is not None:
                 traverse.keep_levels(body.grey_levels)
-            return TraverseAnswer.model_validate(traverse.summary()), created
+            return TraverseAnswer.model_validate(traverse.summary()), is_new
 
-    answer, created = await run_sync(make)
-    response.status_code = 201 if created else 200
-    if created:
+    answer, is_new = await run_sync(make)
+    response.status_code = 201 if is_new else 200
+    if is_new:
         log.info("traverse made", extra={"domain": domain, "traverse": body.name})
     return answer
 
 
 @router.get("", responses=problems(404, 422))
 async def list_traverses(
-    domain: DomainName, running: Running, page: Annotated[Page, page_of("traverses", NAME_PATTERN.removeprefix("^"))]
+    domain: DomainName,
+    services: RunningServices,
+    page: Annotated[Page, page_of("traverses", NAME_PATTERN.removeprefix("^"))],
 ) -> TraverseList:
     """The traverses of a domain, by name."""
-    data_dir = running.settings.data_dir
+    data_dir = services.settings.data_dir
 
     def describe() -> TraverseList:
-        running.catalog.domain(domain)
+        services.catalog.domain(domain)
         names = [name for name in Traverse.list(data_dir, domain) if name > (page.key or "")]
         name_page = ListPage.of(((name, name) for name in names), page.limit)
         answers = []
@@ -164,12 +168,12 @@ async def list_traverses(
 
 
 @router.get("/{name}", responses=problems(404, 422))
-async def get_traverse(domain: DomainName, name: TraverseName, running: Running) -> TraverseAnswer:
+async def get_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> TraverseAnswer:
     """What has arrived of a traverse, and which of its frames are missing."""
 
     def describe() -> TraverseAnswer:
-        running.catalog.domain(domain)
-        data_dir = running.settings.data_dir
+        services.catalog.domain(domain)
+        data_dir = services.settings.data_dir
         with Traverse.open(data_dir, domain, name) as traverse:
             summary = traverse.summary()
         warnings = [*summary.warnings]
@@ -186,18 +190,18 @@ async def get_traverse(domain: DomainName, name: TraverseName, running: Running)
 
 
 @router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
-async def delete_traverse(domain: DomainName, name: TraverseName, running: Running) -> None:
+async def delete_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> None:
     """Remove a traverse and its frames; the maps made from it stay. A job that needs it is a 409."""
 
     def delete() -> None:
-        for job in running.catalog.jobs(domain):
+        for job in services.catalog.jobs(domain):
             traverse_names = {job.config.get(role) for role in TRAVERSE_ROLES}
             if name in traverse_names and not job.state.is_final:
                 raise TraverseInUseError(
                     f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
                 )
-        running.open_traverses.forget(domain, name)
-        Traverse.delete(running.settings.data_dir, domain, name)
+        services.open_traverses.forget(domain, name)
+        Traverse.delete(services.settings.data_dir, domain, name)
 
     await run_sync(delete)
     log.info("traverse deleted", extra={"domain": domain, "traverse": name})

@@ -31,7 +31,7 @@ from deepsimbad.api.requests import (
     NAME_PATTERN,
     LandmarkModelTag,
     Name,
-    Running,
+    RunningServices,
     Services,
     StrictRoute,
     media_type_of,
@@ -143,8 +143,8 @@ def render_whereabouts(
     """The answer of a posterior over domains; the watch runs since the request arrived."""
     domains, places = list[LikelyDomainAnswer](), list[LikelyPlaceAnswer]()
     for name, probability in posterior.probabilities.items():
-        likely: Any = posterior.likeliest[name]
-        answer = render_localization(likely, watch) if isinstance(likely, Localization) else likely
+        localization: Any = posterior.likeliest[name]
+        answer = render_localization(localization, watch) if isinstance(localization, Localization) else localization
         domains.append(
             {
                 "domain": name,
@@ -194,7 +194,7 @@ def _left_out(name: str, error: DeepSimbadError) -> LeftOutAnswer:
 )
 async def post_whereabouts(
     request: Request,
-    running: Running,
+    services: RunningServices,
     domains: DomainNames = None,
     shortlist: Shortlist = None,
     in_full: InFull = 5,
@@ -210,10 +210,10 @@ async def post_whereabouts(
     media_type = media_type_of(request, OBSERVATION_TYPES)
     body = await read_bytes(request)
     watch.lap("receive")
-    observation = await parse_json(body, WhereaboutsBody, running) if media_type == JSON else None
-    names, is_all = await _domain_names(request, running, domains, observation)
-    owners = running.owners
-    gathering = run_sync(running.atlas.gather, names, is_all) if owners is None else owners.gather(names, is_all)
+    observation = await parse_json(body, WhereaboutsBody, services) if media_type == JSON else None
+    names, is_all = await _domain_names(request, services, domains, observation)
+    owners = services.owners
+    gathering = run_sync(services.atlas.gather, names, is_all) if owners is None else owners.gather(names, is_all)
     mapped_domains, left_out = await gathering
     if if_match is not None and (tags := required_tags(if_match)) is not None:
         mapped_domains, mismatches = await run_sync(_with_landmark_models, mapped_domains, tags)
@@ -224,15 +224,15 @@ async def post_whereabouts(
         await run_sync(_check_one_landmark_model, mapped_domains)
     watch.lap("maps")
     parts, remarks = [Part({}, {}, left_out)], list[str]()
-    for evaluator, members in _encoding_groups(running, mapped_domains):
+    for evaluator, members in _encoding_groups(services, mapped_domains):
         try:
-            view, view_remarks = await view_in(body, running, media_type, evaluator, members[0].snapshot, observation)
+            view, view_remarks = await view_in(body, services, media_type, evaluator, members[0].snapshot, observation)
             watch.lap("decode")
-            view = await running.encoded(evaluator, view)
+            view = await services.encoded(evaluator, view)
             watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
             if owners is None:
-                ask = partial(running.atlas.ask, members, evaluator, view, in_full, shortlist)
-                parts.append(await running.worker.computed(ask))
+                ask = partial(services.atlas.ask, members, evaluator, view, in_full, shortlist)
+                parts.append(await services.worker.computed(ask))
             else:
                 parts += await owners.ask(members, view, in_full, shortlist)
         except DeepSimbadError as error:
@@ -243,14 +243,14 @@ async def post_whereabouts(
     posterior = whereabouts(parts, in_full)
     if not posterior.likeliest:
         raise _no_answer(posterior.left_out)
-    _, answer = await running.render_json(
+    _, answer = await services.render_json(
         in_full * (shortlist or 1), render_whereabouts, posterior, watch, remarks, shortlist
     )
     return Response(answer, media_type=JSON)
 
 
 async def _domain_names(
-    request: Request, running: Services, query_names: list[str] | None, observation: WhereaboutsBody | None
+    request: Request, services: Services, query_names: list[str] | None, observation: WhereaboutsBody | None
 ) -> tuple[list[str], bool]:
     """The names of the domains that are asked, without repetitions, and whether these are all that the key opens.
 
@@ -263,7 +263,7 @@ async def _domain_names(
     names: Any = observation.domains if in_body and observation else query_names or ALL
     key_domains = request.scope["state"].get("domains")  # to this key; None: all
     if ALL in names:
-        existing_names = await run_sync(running.catalog.domain_names)
+        existing_names = await run_sync(services.catalog.domain_names)
         return sorted(existing_names if key_domains is None else existing_names & set(key_domains)), True
     if key_domains is not None and not set(names) <= set(key_domains):
         raise ForbiddenError("this key is for other domains", domains=list(key_domains))
@@ -271,12 +271,12 @@ async def _domain_names(
 
 
 def _encoding_groups(
-    running: Services, mapped_domains: Sequence[MappedDomain]
+    services: Services, mapped_domains: Sequence[MappedDomain]
 ) -> list[tuple[Evaluator, list[MappedDomain]]]:
     """The domains, grouped by evaluator and kind of picture: for each group a view is decoded and encoded once."""
     groups: dict[Any, tuple[Evaluator, list[MappedDomain]]] = {}
     for mapped_domain in mapped_domains:
-        evaluator = running.evaluators.evaluator(mapped_domain.record.evaluator)
+        evaluator = services.evaluators.evaluator(mapped_domain.record.evaluator)
         key = id(evaluator), str(levels_in(mapped_domain.snapshot.landmark_model)), mapped_domain.snapshot.cameras
         groups.setdefault(key, (evaluator, []))[1].append(mapped_domain)
     return list(groups.values())
@@ -310,8 +310,8 @@ def _no_answer(left_out: Mapping[str, DeepSimbadError]) -> DeepSimbadError:
         return next(iter(left_out.values()))
     if not left_out:
         return UnknownDomainError("there is no domain that could be asked")
-    first = next(iter(left_out.values()))
+    first_error = next(iter(left_out.values()))
     return NoDomainAnswersError(
-        f"none of {len(left_out)} domains can answer; the first says: {first.message}",
+        f"none of {len(left_out)} domains can answer; the first says: {first_error.message}",
         left_out=[dict(_left_out(name, error)) for name, error in list(left_out.items())[:_MOST_LISTED]],
     )

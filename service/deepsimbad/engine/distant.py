@@ -48,17 +48,17 @@ class Encoder(Protocol):
 
 
 class DistantEvaluator:
-    """An `Evaluator` whose network another process has; what needs no network is done by the `near` evaluator."""
+    """An `Evaluator` whose network another process has; what needs no network is done by the `local` evaluator."""
 
-    def __init__(self, near: Evaluator, config: EvaluatorConfig, encoder: Encoder) -> None:
-        self._near, self._config, self._encoder = near, config, encoder
+    def __init__(self, local: Evaluator, config: EvaluatorConfig, encoder: Encoder) -> None:
+        self._local, self._config, self._encoder = local, config, encoder
         self._facts: NetworkFacts | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name in NetworkFacts.__dataclass_fields__:
             self.load()
             return getattr(self._facts, name)
-        return getattr(self._near, name)
+        return getattr(self._local, name)
 
     def load(self) -> None:
         """See `Evaluator`."""
@@ -88,8 +88,8 @@ def by_encoder(encoder: Encoder) -> Callable[[EvaluatorConfig, Compute | None], 
     def make(config: EvaluatorConfig, compute: Compute | None = None) -> Evaluator:
         if not config.has_network:
             return make_evaluator(config, compute)
-        near = Fused([make(half, compute) for half in config.of]) if config.of else make_evaluator(config, compute)
-        return cast("Evaluator", DistantEvaluator(near, config, encoder))
+        local = Fused([make(half, compute) for half in config.of]) if config.of else make_evaluator(config, compute)
+        return cast("Evaluator", DistantEvaluator(local, config, encoder))
 
     return make
 

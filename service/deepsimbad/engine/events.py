@@ -56,12 +56,12 @@ class SessionEvents:
         snapshot = await asyncio.to_thread(self._store.snapshot_before, record.number, first)
         state = await self._computed(partial(SessionState.restored, engine, snapshot))
         while True:
-            live = self._sessions.living(record.session_id)
-            live_state = None if live is None else live.state
+            session = self._sessions.living(record.session_id)
+            live_state = None if session is None else session.state
             rows: list[JournalRow] = []
-            if live is not None and live_state is not None and live_state.sequence == state.sequence + 1 >= first:
+            if session is not None and live_state is not None and live_state.sequence == state.sequence + 1 >= first:
                 state = live_state
-                yield await self._event(record, state, live.expires_at)
+                yield await self._event(record, state, session.expires_at)
                 continue
             if live_state is None or live_state.sequence != state.sequence:
                 span = (record.number, state.sequence, state.sequence + _ROWS_AT_ONCE)
@@ -72,7 +72,7 @@ class SessionEvents:
                     yield await self._event(record, state, row.expires_at)
             if rows:
                 continue
-            if live is None:
+            if session is None:
                 return
             yield None
             await asyncio.sleep(_GLANCE_S if live_state is not None else self._poll_s)

@@ -226,10 +226,10 @@ def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):  # what overflows is refused below
         encodings = np.ascontiguousarray(values, np.float32)
     # In blocks, so that a large batch is not accompanied by as many booleans.
-    for first in range(0, len(encodings), 1024):
-        finite = np.isfinite(encodings[first : first + 1024]).all(axis=1)
-        if not finite.all():
-            row = first + int(np.flatnonzero(~finite)[0])
+    for start in range(0, len(encodings), 1024):
+        is_finite = np.isfinite(encodings[start : start + 1024]).all(axis=1)
+        if not is_finite.all():
+            row = start + int(np.flatnonzero(~is_finite)[0])
             raise InvalidEncodingError(f"encoding {row} holds NaN, infinity or a number too large for float32", row=row)
     return encodings
 

@@ -152,9 +152,9 @@ class Maps:
             return
         self._confirmed_at = now_s
         mapped_domains = self._active.copy()
-        serving = self._catalog.serving_versions(list(mapped_domains))
+        serving_versions = self._catalog.serving_versions(list(mapped_domains))
         for domain, mapped_domain in mapped_domains.items():
-            if serving.get(domain) == (mapped_domain.record.created_at, mapped_domain.snapshot.version):
+            if serving_versions.get(domain) == (mapped_domain.record.created_at, mapped_domain.snapshot.version):
                 self._checked_at[domain] = now_s
 
     def forget(self, domain: str) -> None:
@@ -219,7 +219,7 @@ class Maps:
     def _current(self, record: DomainRecord) -> Map:
         domain, version = record.name, record.active_version
         if version is None:
-            raise no_active_map(domain)
+            raise no_active_map_error(domain)
         if domain in self._damages:
             damaged_version, damage, noticed_at = self._damages[domain]
             if damaged_version == version and self._clock() - noticed_at < _DAMAGE_REMEMBERED_S:
@@ -296,10 +296,10 @@ class Maps:
             try:
                 record, map_record = self._catalog.domain(domain), self._catalog.map(domain, version)
             except (UnknownDomainError, UnknownMapVersionError) as error:
-                raise retired(domain, version) from error
+                raise retired_error(domain, version) from error
             is_removed = map_record.state is not MapState.ACTIVE and not self._catalog.has_file(domain, version)
             if map_record.sha256 != digest or (is_removed and (domain, version, digest) not in self._snapshots):
-                raise retired(domain, version)
+                raise retired_error(domain, version)
             return MappedDomain(record, self._load(domain, version, digest))
 
     def serves(self, domain: str) -> bool:
@@ -417,7 +417,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
             _ = snapshot.relevance  # without one it can answer nothing
             return snapshot
     except (DeepSimbadError, KeyError, TypeError, ValueError) as error:
-        answer = unreadable(catalog, domain, version)
+        answer = unreadable_error(catalog, domain, version)
         is_damaged = not isinstance(error, UnavailableError) or isinstance(error, DamagedMapError)
         if isinstance(answer, RetiredMapError) or is_damaged:
             raise answer from error
@@ -430,7 +430,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
         ) from error
 
 
-def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
+def unreadable_error(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
     """The error for a map file that cannot be read: its cause names a file, this what a person can do."""
     if catalog.map(domain, version).removed_at is not None:  # just now
         return removal_error(domain, version)
@@ -441,12 +441,12 @@ def unreadable(catalog: Catalog, domain: str, version: int) -> DeepSimbadError:
     )
 
 
-def no_active_map(domain: str) -> NoActiveMapError:
+def no_active_map_error(domain: str) -> NoActiveMapError:
     """The error for a domain before its first map."""
     return NoActiveMapError(f"domain {domain} has no active map: upload traverses and start a remap", domain=domain)
 
 
-def retired(domain: str, version: int) -> RetiredMapError:
+def retired_error(domain: str, version: int) -> RetiredMapError:
     """The error for a session whose map is no more."""
     return RetiredMapError(
         f"map {version} of domain {domain}, which the session was begun on, is no more: begin a new session",

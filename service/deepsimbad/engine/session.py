@@ -261,13 +261,15 @@ class SessionView:
     remarks: Sequence[str] = ()  # for a person, on the view
 
 
-def view_of(live: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None) -> SessionView:
+def view_of(
+    session: LiveSession, expires_at: float, state: SessionState, n_shortlist: int | None = None
+) -> SessionView:
     """Summarise a state, with lists of the default length where `n_shortlist` is None; milliseconds of work."""
     snapshot, belief, step = state.engine.snapshot, state.belief, state.step
     length = shortlist_length(snapshot, n_shortlist)
     summary = summarise(snapshot.route, belief.belief.mass, length, belief.belief.off_route)
     return SessionView(
-        session_id=live.record.session_id,
+        session_id=session.record.session_id,
         expires_at=expires_at,
         snapshot=snapshot,
         n_observations=belief.n_observations,

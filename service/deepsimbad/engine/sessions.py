@@ -100,15 +100,19 @@ class Sessions:
 
     def living(self, session_id: str) -> LiveSession | None:
         """A session that has not ended, as far as is known without reading the store; None where there is none."""
-        live = self._living.get(session_id)
-        return None if live is None or live.ending is not None else live
+        session = self._living.get(session_id)
+        return None if session is None or session.ending is not None else session
 
     def close(self) -> None:
         """End the thread of summaries."""
         self._summaries.shutdown()
 
     async def begin(
-        self, active: MappedDomain, config: SessionConfig, session_id: str | None = None, key_id: str | None = None
+        self,
+        mapped_domain: MappedDomain,
+        config: SessionConfig,
+        session_id: str | None = None,
+        key_id: str | None = None,
     ) -> SessionView:
         """Begin a session on a domain's active map.
 
@@ -123,14 +127,14 @@ class Sessions:
             IdempotencyKeyReusedError: A session of that id began with another configuration.
             EndedSessionError: The session of that id has ended.
         """
-        digits = domain_digits(active.record.name)
+        digits = domain_digits(mapped_domain.record.name)
         if session_id is not None:
             session_id = digits + session_id[len(digits) :]
             with suppress(UnknownSessionError):
                 return await self._begun_before(session_id, config)
-        check_prior(active.snapshot.route, config.start_position_m, config.start_std_m)
+        check_prior(mapped_domain.snapshot.route, config.start_position_m, config.start_std_m)
         session_id = session_id or digits + secrets.token_hex(12)
-        return await self._finished(self._begin(active, config, session_id, key_id))
+        return await self._finished(self._begin(mapped_domain, config, session_id, key_id))
 
     async def observe(
         self, session_id: str, observation: Observation, watch: Stopwatch | None = None, key_id: str | None = None
@@ -146,30 +150,32 @@ class Sessions:
             IdempotencyKeyReusedError: Its idempotency key came before with another observation.
             SessionMovedError: Another node counted another observation at this moment.
         """
-        live, watch = await self._find(session_id, key_id), watch or Stopwatch()
+        session, watch = await self._find(session_id, key_id), watch or Stopwatch()
         try:
-            return await self._finished(self._observe(live, observation, watch))
+            return await self._finished(self._observe(session, observation, watch))
         except SessionMovedError:
-            live = await self._find(session_id, key_id)  # reads what another node has written
-            number, idempotency = live.record.number, observation.idempotency
+            session = await self._find(session_id, key_id)  # reads what another node has written
+            number, idempotency = session.record.number, observation.idempotency
             if (
                 idempotency is None
                 or await asyncio.to_thread(self._store.find_observation, number, idempotency.key) is None
             ):
                 raise
-            return await self._finished(self._observe(live, observation, watch))  # which was this observation
+            return await self._finished(self._observe(session, observation, watch))  # which was this observation
 
     async def set_prior(
         self, session_id: str, position_m: float, std_m: float, key_id: str | None = None
     ) -> SessionView:
         """Replace a session's belief by one around a position; raises InvalidPriorError."""
-        live = await self._find(session_id, key_id)
-        return await self._finished(self._set_prior(live, position_m, std_m))
+        session = await self._find(session_id, key_id)
+        return await self._finished(self._set_prior(session, position_m, std_m))
 
     async def view(self, session_id: str, n_shortlist: int | None = None, key_id: str | None = None) -> SessionView:
         """A session as it stands now."""
-        live, state = await self._read(session_id, key_id)
-        return await asyncio.wrap_future(self._summaries.submit(view_of, live, live.expires_at, state, n_shortlist))
+        session, state = await self._read(session_id, key_id)
+        return await asyncio.wrap_future(
+            self._summaries.submit(view_of, session, session.expires_at, state, n_shortlist)
+        )
 
     async def mass(self, session_id: str, key_id: str | None = None) -> NDArray[np.float64]:
         """[n] mass of every map image in a session's belief; sums to 1."""
@@ -186,10 +192,10 @@ class Sessions:
 
     async def end_those(self, is_over: Callable[[SessionRecord], bool]) -> None:
         """End the living sessions for which `is_over` holds, as those of a deleted domain."""
-        for live in list(self._living.values()):
-            if live.ending is None and is_over(live.record):
+        for session in list(self._living.values()):
+            if session.ending is None and is_over(session.record):
                 with suppress(EndedSessionError):  # its robot was quicker
-                    await self._finished(self._end(live, DELETED))
+                    await self._finished(self._end(session, DELETED))
 
     async def sweep(self) -> None:
         """End what has expired, and forget what ended long ago."""
@@ -214,15 +220,15 @@ class Sessions:
     # Beginning
 
     async def _begun_before(self, session_id: str, config: SessionConfig) -> SessionView:
-        live = await self._find(session_id)
-        if live.record.config != config.as_dict():
+        session = await self._find(session_id)
+        if session.record.config != config.as_dict():
             raise IdempotencyKeyReusedError(
                 "this idempotency key began a session with another configuration: choose a new one"
             )
         return await self.view(session_id)
 
     async def _begin(
-        self, active: MappedDomain, config: SessionConfig, session_id: str, key_id: str | None
+        self, mapped_domain: MappedDomain, config: SessionConfig, session_id: str, key_id: str | None
     ) -> SessionView:
         crowd = self._crowd(key_id, await self._holders(may_have_ended=True))
         if crowd is not None:
@@ -232,10 +238,10 @@ class Sessions:
             raise crowd
         self._n_beginning[key_id] += 1
         try:
-            snapshot = active.snapshot
+            snapshot = mapped_domain.snapshot
             with self._maps.beginning(snapshot):
                 digest = await asyncio.to_thread(self._maps.digest, snapshot)
-                engine = SessionEngine(config, snapshot, self._evaluators.evaluator(active.record.evaluator))
+                engine = SessionEngine(config, snapshot, self._evaluators.evaluator(mapped_domain.record.evaluator))
                 state = await asyncio.wrap_future(self._worker.submit(lambda: SessionState.start(engine)))
                 now_s = self._clock()
                 new_record = SessionRecord(
@@ -255,8 +261,8 @@ class Sessions:
             if replace(record, number=0) != new_record:  # the same request came twice at once, and the other was first
                 return await self._begun_before(session_id, config)
             # A repetition may have found it on the disk already.
-            live = self._living.setdefault(session_id, LiveSession(record, record.expires_at, state))
-            return await asyncio.wrap_future(self._summaries.submit(view_of, live, record.expires_at, state))
+            session = self._living.setdefault(session_id, LiveSession(record, record.expires_at, state))
+            return await asyncio.wrap_future(self._summaries.submit(view_of, session, record.expires_at, state))
         finally:
             self._n_beginning[key_id] -= 1
 
@@ -264,7 +270,7 @@ class Sessions:
         """The API key of every session that lives, wherever it does; see `SessionStore.holders`."""
         if self._store.is_shared:
             return await asyncio.to_thread(partial(self._store.holders, may_have_ended=may_have_ended))
-        return [live.record.key_id for live in self._living.values()]
+        return [session.record.key_id for session in self._living.values()]
 
     def _crowd(self, key_id: str | None, holders: Sequence[str | None]) -> TooManySessionsError | None:
         """The error where no further session may live, of all or of this key; None where one may."""
@@ -273,11 +279,11 @@ class Sessions:
         if len(holders) + self._n_beginning.total() < limit:
             if key_id is None:
                 return None
-            rivals = [live for live in rivals if live.record.key_id == key_id]
+            rivals = [session for session in rivals if session.record.key_id == key_id]
             setting, limit, whose = "max_sessions_per_key", self._max_sessions_per_key, "sessions of this key"
             if holders.count(key_id) + self._n_beginning[key_id] < limit:
                 return None
-        soonest_s = min((live.expires_at for live in rivals), default=0.0) - self._clock()
+        soonest_s = min((session.expires_at for session in rivals), default=0.0) - self._clock()
         hints = {setting: limit, "limit": setting, "retry_after_s": max(1, min(_LONGEST_RETRY_S, math.ceil(soonest_s)))}
         return TooManySessionsError(
             f"{limit} {whose} live, and no more may: delete one that is done with, or wait", **hints
@@ -292,41 +298,41 @@ class Sessions:
             UnknownSessionError: There is none of that id, or it belongs to another key.
             EndedSessionError: It has been deleted, or has expired.
         """
-        live = self._living.get(session_id)
-        if live is None:
+        session = self._living.get(session_id)
+        if session is None:
             record = await asyncio.to_thread(self._store.find, session_id)
             check_owner(record, key_id)
             if record.ending is not None:
                 raise _ended_error(session_id, record.ending)
-            live = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
+            session = self._living.setdefault(session_id, LiveSession(record, record.expires_at))  # begun this moment
         if key_id is not None:
-            check_owner(live.record, key_id)
+            check_owner(session.record, key_id)
         if self._store.is_shared:
-            async with live.lock:
-                self._heed(live, await asyncio.to_thread(self._store.find, session_id))
-        if self._clock() >= live.expires_at and not live.lock.locked():
-            await self._end(live, EXPIRED)
-        if live.ending is not None:
-            raise _ended_error(session_id, live.ending)
-        return live
+            async with session.lock:
+                self._heed(session, await asyncio.to_thread(self._store.find, session_id))
+        if self._clock() >= session.expires_at and not session.lock.locked():
+            await self._end(session, EXPIRED)
+        if session.ending is not None:
+            raise _ended_error(session_id, session.ending)
+        return session
 
-    def _heed(self, live: LiveSession, record: SessionRecord) -> None:
+    def _heed(self, session: LiveSession, record: SessionRecord) -> None:
         """Drop the state of a session that another node has moved on or ended, by its row in the store."""
-        live.expires_at = record.expires_at
-        if live.state is not None and live.state.sequence != record.n_events:
-            live.state = None
+        session.expires_at = record.expires_at
+        if session.state is not None and session.state.sequence != record.n_events:
+            session.state = None
         if record.ending is not None:
-            live.ending, live.state = record.ending, None
+            session.ending, session.state = record.ending, None
             self._living.pop(record.session_id, None)
 
     async def _read(self, session_id: str, key_id: str | None) -> tuple[LiveSession, SessionState]:
-        live = await self._find(session_id, key_id)
-        if live.state is None:
-            async with live.lock:
-                return live, await self._state(live)
-        return live, live.state
+        session = await self._find(session_id, key_id)
+        if session.state is None:
+            async with session.lock:
+                return session, await self._state(session)
+        return session, session.state
 
-    async def _state(self, live: LiveSession) -> SessionState:
+    async def _state(self, session: LiveSession) -> SessionState:
         """The state of a session, read from the disk where it is not in memory; the caller holds the session's lock.
 
         Raises:
@@ -334,11 +340,11 @@ class Sessions:
             RetiredMapError: Its map is no more.
             DamagedMapError, DamagedFileError: The map or the session cannot be read.
         """
-        if live.ending is not None:
-            raise _ended_error(live.record.session_id, live.ending)
-        if live.state is None:
-            live.state = await asyncio.to_thread(self._from_disk, live.record)
-        return live.state
+        if session.ending is not None:
+            raise _ended_error(session.record.session_id, session.ending)
+        if session.state is None:
+            session.state = await asyncio.to_thread(self._from_disk, session.record)
+        return session.state
 
     def _from_disk(self, record: SessionRecord) -> SessionState:
         engine = self.engine_of(record)
@@ -350,10 +356,10 @@ class Sessions:
 
     # Moving on
 
-    async def _observe(self, live: LiveSession, observation: Observation, watch: Stopwatch) -> SessionView:
+    async def _observe(self, session: LiveSession, observation: Observation, watch: Stopwatch) -> SessionView:
         """Decode, describe, compute, write and publish, in this order and under the session's lock."""
-        async with live.lock:
-            state = live.state or await self._state(live)
+        async with session.lock:
+            state = session.state or await self._state(session)
             engine = state.engine
             observation.check(engine.snapshot)
             watch.lap("wait")
@@ -361,19 +367,19 @@ class Sessions:
             watch.lap("decode")
             if isinstance(view, np.ndarray | Scene):
                 view = await encoded(self._worker, engine.evaluator, view)
-            step = partial(self._step, live, state, observation, self._clock() + self._ttl_s, watch, view)
+            step = partial(self._step, session, state, observation, self._clock() + self._ttl_s, watch, view)
             try:
                 answer = await self._published(
-                    live, step, watch, is_short=is_short(engine.snapshot, view, observation.n_shortlist)
+                    session, step, watch, is_short=is_short(engine.snapshot, view, observation.n_shortlist)
                 )
             except _CountedBefore as repetition:
-                answer = await self._repeated(live, state, repetition.sequence, observation.n_shortlist)
+                answer = await self._repeated(session, state, repetition.sequence, observation.n_shortlist)
                 watch.lap("summarise")
             return replace(answer, remarks=remarks) if remarks else answer
 
     def _step(
         self,
-        live: LiveSession,
+        session: LiveSession,
         state: SessionState,
         observation: Observation,
         expires_at: float,
@@ -384,7 +390,7 @@ class Sessions:
         watch.lap("wait", {"encode": view.encode_ms} if isinstance(view, EncodedImage) else None)
         idempotency, snapshot = observation.idempotency, state.engine.snapshot
         if idempotency is not None:
-            earlier = self._store.find_observation(live.record.number, idempotency.key)
+            earlier = self._store.find_observation(session.record.number, idempotency.key)
             if earlier is not None and earlier[1] != idempotency.digest:
                 raise IdempotencyKeyReusedError(
                     "this idempotency key came before with another observation: choose a new one"
@@ -408,10 +414,10 @@ class Sessions:
             encoding=encoding,
             idempotency=observation.idempotency,
         )
-        return self._move_on(live, state, row, observation.n_shortlist, watch)
+        return self._move_on(session, state, row, observation.n_shortlist, watch)
 
     def _move_on(
-        self, live: LiveSession, previous: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
+        self, session: LiveSession, previous: SessionState, row: JournalRow, n_shortlist: int | None, watch: Stopwatch
     ) -> "_Move":
         """The state after a row, which is written while the answer is summed up."""
         state = previous.next_state(row)
@@ -421,16 +427,16 @@ class Sessions:
         if previous.sequence > 0 and previous.sequence % self._snapshot_every == 0:
             # Of the state before the row, so that a restart replays at least the last row and has its whole step.
             snapshot = previous.snapshot()
-        commit = self._store.append(live.record.number, row, self._clock(), snapshot)
+        commit = self._store.append(session.record.number, row, self._clock(), snapshot)
         try:
-            answer = view_of(live, row.expires_at, state, n_shortlist)
+            answer = view_of(session, row.expires_at, state, n_shortlist)
         except Exception as error:
             raise _NotSummedUp(commit) from error
         watch.lap("summarise")
         return _Move(state, answer, commit)
 
     async def _published(
-        self, live: LiveSession, move_on: "Callable[[], _Move]", watch: Stopwatch, *, is_short: bool = False
+        self, session: LiveSession, move_on: "Callable[[], _Move]", watch: Stopwatch, *, is_short: bool = False
     ) -> SessionView:
         """Move a session on by `move_on`; its answer, once the move is on the disk."""
         is_written = False
@@ -438,58 +444,60 @@ class Sessions:
             move = await self._worker.computed(move_on, is_short=is_short)
             is_written = True
             await asyncio.wrap_future(move.commit)
-        except _NotSummedUp as failed:
-            live.state = None
-            await asyncio.wrap_future(failed.commit)  # the row counts, and is there when the session is read again
+        except _NotSummedUp as failure:
+            session.state = None
+            await asyncio.wrap_future(failure.commit)  # the row counts, and is there when the session is read again
             raise
         except BaseException as error:
             if is_written or not isinstance(error, DeepSimbadError | _CountedBefore):
-                live.state = None  # what the file holds is the truth: it is read again at the next touch
+                session.state = None  # what the file holds is the truth: it is read again at the next touch
             raise
-        live.expires_at, live.state = move.answer.expires_at, move.state
+        session.expires_at, session.state = move.answer.expires_at, move.state
         watch.lap("commit")
         return move.answer
 
     async def _repeated(
-        self, live: LiveSession, state: SessionState, sequence: int, n_shortlist: int | None
+        self, session: LiveSession, state: SessionState, sequence: int, n_shortlist: int | None
     ) -> SessionView:
         """The answer to an observation counted before, computed again: the same journal leads to the same belief."""
         if state.sequence != sequence:
             async with self._repeating:  # a replay is long: many of them take turns
-                snapshot = await asyncio.to_thread(self._store.snapshot_before, live.record.number, sequence)
+                snapshot = await asyncio.to_thread(self._store.snapshot_before, session.record.number, sequence)
                 state = await replayed_until(
                     self._store,
                     self._worker,
-                    live.record,
+                    session.record,
                     state.engine,
                     lambda row, _: row.sequence == sequence,
                     snapshot,
                 )
-        answer = await asyncio.wrap_future(self._summaries.submit(view_of, live, live.expires_at, state, n_shortlist))
+        answer = await asyncio.wrap_future(
+            self._summaries.submit(view_of, session, session.expires_at, state, n_shortlist)
+        )
         return replace(answer, is_repeated=True)
 
-    async def _set_prior(self, live: LiveSession, position_m: float, std_m: float) -> SessionView:
-        async with live.lock:
-            state = live.state or await self._state(live)
+    async def _set_prior(self, session: LiveSession, position_m: float, std_m: float) -> SessionView:
+        async with session.lock:
+            state = session.state or await self._state(session)
             check_prior(state.engine.snapshot.route, position_m, std_m)
             row = PriorRow(state.sequence + 1, self._clock() + self._ttl_s, position_m, std_m)
             watch = Stopwatch()
-            return await self._published(live, lambda: self._move_on(live, state, row, None, watch), watch)
+            return await self._published(session, lambda: self._move_on(session, state, row, None, watch), watch)
 
     # Ending
 
-    async def _end(self, live: LiveSession, ending: str) -> None:
+    async def _end(self, session: LiveSession, ending: str) -> None:
         """End a session after the change under way; raises EndedSessionError where it had ended before."""
-        async with live.lock:
-            if live.ending is not None:
-                raise _ended_error(live.record.session_id, live.ending)
-            await asyncio.wrap_future(self._store.end(live.record.number, ending, self._clock()))
-            self._heed(live, await asyncio.to_thread(self._store.find, live.record.session_id))
+        async with session.lock:
+            if session.ending is not None:
+                raise _ended_error(session.record.session_id, session.ending)
+            await asyncio.wrap_future(self._store.end(session.record.number, ending, self._clock()))
+            self._heed(session, await asyncio.to_thread(self._store.find, session.record.session_id))
 
     async def _expire(self) -> None:
-        for live in list(self._living.values()):
-            if live.ending is None and self._clock() >= live.expires_at and not live.lock.locked():
-                await self._end(live, EXPIRED)
+        for session in list(self._living.values()):
+            if session.ending is None and self._clock() >= session.expires_at and not session.lock.locked():
+                await self._end(session, EXPIRED)
 
     # Tasks
 

@@ -54,8 +54,8 @@ class OpenTraverses:
             loan = self._open[key]
             loan.n_users += 1
             idle_keys = [other for other in self._open if not self._open[other].n_users]
-            for oldest in idle_keys[: max(0, len(self._open) - MAX_IDLE)]:
-                self._drop(oldest)
+            for oldest_key in idle_keys[: max(0, len(self._open) - MAX_IDLE)]:
+                self._drop(oldest_key)
         try:
             yield loan.traverse
         except UnknownTraverseError:  # another process deleted it under us
@@ -107,15 +107,15 @@ class SpoolRoom:
                         spooled_bytes[name] = traverse.spooled_bytes
                 self._spooled_bytes[domain] = sum(spooled_bytes.values())
             if self._spooled_bytes[domain] + n_bytes > self._max_bytes:
-                fullest = max(spooled_bytes, key=lambda name: spooled_bytes[name])
+                fullest_name = max(spooled_bytes, key=lambda name: spooled_bytes[name])
                 raise SpoolFullError(
                     f"{self._spooled_bytes[domain]} bytes of images wait in domain {domain} for its evaluator to be "
                     f"fitted, and {self._max_bytes} are the most: remap with the traverse that holds most of them, "
-                    f"{fullest}, or delete it, or raise the setting max_spool_bytes; the frame was not stored",
+                    f"{fullest_name}, or delete it, or raise the setting max_spool_bytes; the frame was not stored",
                     limit="max_spool_bytes",
                     max_spool_bytes=self._max_bytes,
                     spooled_bytes=self._spooled_bytes[domain],
-                    traverse=fullest,
+                    traverse=fullest_name,
                 )
             self._spooled_bytes[domain] += n_bytes
 

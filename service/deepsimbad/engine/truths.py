@@ -130,20 +130,20 @@ class Truths:
         record, engine, truth_m = await asyncio.to_thread(prepare)
         route = engine.snapshot.route
         images = _checked_images(true_map_images, truth_m.size, first, route.n_images)
-        nearest = true_images(route, truth_m)
+        nearest_images = true_images(route, truth_m)
         share, retrieval = np.full((2, truth_m.size), np.nan)
 
         def rank(number: int, state: LocalizerState) -> None:
             if not math.isnan(truth_m[number]):
                 mass = state.belief.mass
-                share[number] = rank_of_truth(mass, nearest[number : number + 1]) / mass.size
+                share[number] = rank_of_truth(mass, nearest_images[number : number + 1]) / mass.size
             if number in images and state.relevance is not None:
                 retrieval[number] = rank_of_truth(state.relevance, images[number])
 
         numbers = np.union1d(np.flatnonzero(~np.isnan(truth_m)), list(images)).astype(int)
         if numbers.size:
             await self._follow(record, engine, numbers[0], numbers[-1], rank)
-        apart_m = np.abs(route.offset_m(route.position_m[nearest], truth_m))
+        apart_m = np.abs(route.offset_m(route.position_m[nearest_images], truth_m))
         share[~(apart_m <= _FARTHEST_M)] = np.nan  # unknown ones too
         return RankedTruths(record, truth_m, share, None if true_map_images is None else retrieval, first)
 

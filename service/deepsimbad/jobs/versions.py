@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from deepsimbad.core.experience.nnql import KnownWalk, NnqlConfig, initial_q_values, learn, transitions_of
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Query
-from deepsimbad.engine.maps import retired, unreadable
+from deepsimbad.engine.maps import retired_error, unreadable_error
 from deepsimbad.engine.truths import checked_truths
 from deepsimbad.errors import (
     ConflictError,
@@ -177,9 +177,9 @@ def _check_landmarks(catalog: Catalog, record: SessionRecord, active_version: in
     try:
         is_same_file = catalog.map(record.domain, record.map_version).sha256 == record.map_sha256
     except UnknownMapVersionError as error:
-        raise retired(record.domain, record.map_version) from error
+        raise retired_error(record.domain, record.map_version) from error
     if not is_same_file:  # the domain was deleted since and made anew
-        raise retired(record.domain, record.map_version)
+        raise retired_error(record.domain, record.map_version)
     if active_version is None or record.map_version == active_version:
         return
     session_model, active_model = (
@@ -199,7 +199,7 @@ def _landmarks(catalog: Catalog, domain: str, version: int) -> Mapping[str, NDAr
     try:
         return read_map(catalog.map_file(domain, version)).landmark_model
     except DamagedMapError as error:  # perhaps because its file was removed
-        raise unreadable(catalog, domain, version) from error
+        raise unreadable_error(catalog, domain, version) from error
 
 
 def learn_online(
