@@ -16,7 +16,7 @@ PROGRAMS = {"deepsimbad": deepsimbad, "deepsimbad-client": deepsimbad_client}
 
 
 @dataclass(frozen=True)
-class Ran:
+class CommandResult:
     code: int
     out: str
     err: str
@@ -35,7 +35,7 @@ def is_plain(text: str) -> bool:
     return text.partition(" ")[0] in PROGRAMS and re.search(r"[|<>$`*;&\\]", text) is None
 
 
-def ran(text: str | list[object], folder: Path | None = None, **environment: str) -> Ran:
+def run_command(text: str | list[object], folder: Path | None = None, **environment: str) -> CommandResult:
     """Run a command, given as a line or as words, in a folder."""
     program, *arguments = shlex.split(text) if isinstance(text, str) else map(str, text)
     out, err = io.StringIO(), io.StringIO()
@@ -45,4 +45,4 @@ def ran(text: str | list[object], folder: Path | None = None, **environment: str
         for name, value in environment.items():
             patched.setenv(name, value)
         code = PROGRAMS[program](arguments)
-    return Ran(code, out.getvalue(), err.getvalue())
+    return CommandResult(code, out.getvalue(), err.getvalue())

@@ -89,14 +89,16 @@ def _compile(shared: Path) -> None:
     """Compile the kernels once for all test processes: in a new checkout each would spend half a minute on it."""
     from deepsimbad.engine.localizer import warm_up  # noqa: PLC0415 - seconds that a single file may do without
 
-    from .commands import ran  # noqa: PLC0415
+    from .commands import run_command  # noqa: PLC0415
 
     with one_at_a_time(shared, "kernels"):
         if not (folder := shared / "kernels").exists():
             folder.mkdir()
             np.save(folder / "drive.npy", np.random.default_rng(0).normal(size=(60, 8)).astype(np.float32))
             warm_up()
-            ran("deepsimbad map drive --landmarks drive.npy --training drive.npy --evaluator feature_l2:none", folder)
+            run_command(
+                "deepsimbad map drive --landmarks drive.npy --training drive.npy --evaluator feature_l2:none", folder
+            )
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -29,7 +29,7 @@ ARGUMENTS = inspect.signature(subprocess.Popen._execute_child)
 
 
 def read_by_imports(environment):
-    """The variables that imports may read; one thread for computing is no difference, for imports wait for none."""
+    """The variables that imports may read, without settings of one thread, which make no difference to them."""
     read_later = ("DEEPSIMBAD_", "PYTEST_", "OPENBLAS_THREAD_TIMEOUT")
     return {
         name: value

@@ -12,21 +12,21 @@ import pytest
 
 from deepsimbad.cli import run
 
-from ..commands import Ran
+from ..commands import CommandResult
 
 
 @pytest.fixture
-def deepsimbad(capfd, monkeypatch, tmp_path) -> Callable[..., Ran]:
+def deepsimbad(capfd, monkeypatch, tmp_path) -> Callable[..., CommandResult]:
     """Runs the command in this process, in an empty folder."""
     for name in os.environ:
         if name.startswith("DEEPSIMBAD_"):
             monkeypatch.delenv(name)
     monkeypatch.chdir(tmp_path)
 
-    def call(*arguments: object) -> Ran:
+    def call(*arguments: object) -> CommandResult:
         capfd.readouterr()
         code = run([str(argument) for argument in arguments])
-        return Ran(code, *capfd.readouterr())
+        return CommandResult(code, *capfd.readouterr())
 
     return call
 

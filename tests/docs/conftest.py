@@ -11,7 +11,7 @@ import pytest
 
 from deepsimbad_client.http.local_server import LocalServer
 
-from ..commands import is_plain, ran
+from ..commands import is_plain, run_command
 
 PROJECT = Path(__file__).resolve().parents[2]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -77,7 +77,7 @@ class Workplace:
         if (key := self.folder / "operator.key").is_file():
             environment["DEEPSIMBAD_API_KEY"] = key.read_text().strip()
         if is_plain(text) and not program:
-            plain = ran(here, self.folder, **environment)
+            plain = run_command(here, self.folder, **environment)
             assert plain.code == 0, f"{text}\n{plain.out}{plain.err}"
             self.output[text] = plain.out
             return plain.out

@@ -17,7 +17,7 @@ import httpx2
 import numpy as np
 import pytest
 
-from ..commands import Ran, ran
+from ..commands import CommandResult, run_command
 from ..conftest import one_at_a_time
 from ..fork_server import Popen
 
@@ -26,10 +26,10 @@ N_PLACES, DIM, N_LANDMARKS = 60, 8, 12
 NPZ = {"Content-Type": "application/octet-stream"}
 
 
-def command(*arguments: object) -> Ran:
+def command(*arguments: object) -> CommandResult:
     """Run `deepsimbad`; a service in a process of its own."""
     if arguments[0] != "serve":
-        return ran(["deepsimbad", *arguments])
+        return run_command(["deepsimbad", *arguments])
     process = subprocess.run(
         [sys.executable, "-m", "deepsimbad", *map(str, arguments)],
         capture_output=True,
@@ -37,7 +37,7 @@ def command(*arguments: object) -> Ran:
         check=False,
         timeout=120,
     )
-    return Ran(process.returncode, process.stdout, process.stderr)
+    return CommandResult(process.returncode, process.stdout, process.stderr)
 
 
 SERVE = [sys.executable, "-m", "deepsimbad", "serve", "--create"]
@@ -217,8 +217,8 @@ def begin(service: Service, n_views: int = 3) -> str:
 
 def check_is_clean(data_dir: Path) -> None:
     """Check that `deepsimbad check` finds nothing damaged."""
-    ran = command("check", "--data-dir", data_dir)
-    assert (ran.code, ran.out) == (0, ""), ran
+    result = command("check", "--data-dir", data_dir)
+    assert (result.code, result.out) == (0, ""), result
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ..commands import Ran
+from ..commands import CommandResult
 from ..killing import PROJECT
 from .conftest import command
 
@@ -25,18 +25,19 @@ os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
 """
 COMMANDS = """
 import dataclasses, json, sys
-from tests.commands import ran
-print(json.dumps([dataclasses.astuple(ran(["deepsimbad", *words])) for words in json.loads(sys.argv[1])]))
+from tests.commands import run_command
+results = (run_command(["deepsimbad", *words]) for words in json.loads(sys.argv[1]))
+print(json.dumps([dataclasses.astuple(result) for result in results]))
 """
 
 
-def unprivileged(*commands: tuple[object, ...]) -> list[Ran]:
+def unprivileged(*commands: tuple[object, ...]) -> list[CommandResult]:
     """Run commands of `deepsimbad`, one after the other, as somebody who may not write everywhere."""
     words = json.dumps([[str(word) for word in command] for command in commands])
     program = [sys.executable, "-c", UNPRIVILEGED, "-c", COMMANDS, words]
     process = subprocess.run(program, cwd=PROJECT, capture_output=True, text=True, check=False, timeout=120)
     assert process.returncode == 0, process.stderr
-    return [Ran(*fields) for fields in json.loads(process.stdout)]
+    return [CommandResult(*fields) for fields in json.loads(process.stdout)]
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from deepsimbad_client.recordings.track import (
 )
 
 UNPLACED = math.nan  # position_m of a frame for which the source states none
-LEAPS = 2.0  # times the longest step of their own order that frames may step in another, or they leap in that
+LEAPS = 2.0  # frames leap in another order if a step is more than so many times the longest of their own order
 STATED_SPEEDS = 100.0  # times the typical speed that stated positions may jump at: somebody may have meant it
 
 

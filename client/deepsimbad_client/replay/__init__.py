@@ -167,7 +167,7 @@ def changed_map(domain: str) -> ReplayError:
 
 
 def right_answers(recording: Recording, route: Route, within_m: float) -> list[NDArray[np.int64]]:
-    """For each frame the map images [k] that are right answers, also where the frames go backwards along the route."""
+    """For each frame the map images [k] that are right answers; frames in reverse order still look forwards."""
     columns = columns_of(recording.frames)
     position_m, x_m, y_m = (columns[name] for name in ("position_m", "x_m", "y_m"))
     order = np.argsort(position_m, kind="stable")

@@ -54,34 +54,34 @@ def test_another_drive_or_corrected_positions_never_pass_for_what_is_there(clien
         (folder / "positions.csv").write_text("\n".join(["name,position_m,timestamp_us", *lines]))
         return ["upload", str(folder), "--server", client.url, "--domain", "identity", "--traverse", "drive"]
 
-    def ran(command):
+    def run_and_read(command):
         code, (out, err) = run(command), capsys.readouterr()
         return code, out, err
 
     client.admin.put_domain("identity", {"kind": "feature_l2", "extractor": "gradient_grid"})
     summer = drive("summer", 1, 6, 1)
-    assert ran(summer)[0] == 0
+    assert run_and_read(summer)[0] == 0
     first = client.admin.traverse("identity", "drive")
     assert (first.n_frames, first.length_m, first.span_us) == (6, 5.0, (1_700_000_000_000_000, 1_700_000_001_000_000))
-    code, out, _ = ran(summer)
+    code, out, _ = run_and_read(summer)
     assert (code, "0 frames sent" in out, "6 were there already" in out) == (0, True, True)
     for changed, differ in (
         (("summer", 1, 6, 7), "5 of the 6 that both have differ in position (1.png, 2.png, 3.png, ...)"),
         (("summer", 1, 6, 1, 1_600_000_000_000_000), "6 of the 6 that both have differ in time"),
         (("winter", 2, 8, 1), "6 of the 6 that both have differ in content"),
     ):
-        code, out, err = ran(drive(*changed))
+        code, out, err = run_and_read(drive(*changed))
         assert (code, out) == (1, "")
         assert differ in err
         assert "--replace" in err
         assert client.admin.traverse("identity", "drive") == first
-    code, out, _ = ran([*drive("summer", 1, 6, 7), "--replace"])
+    code, out, _ = run_and_read([*drive("summer", 1, 6, 7), "--replace"])
     assert (code, "5 frames sent" in out, "1 were there already" in out) == (0, True, True)
     corrected = client.admin.traverse("identity", "drive")
     assert (corrected.n_frames, corrected.length_m) == (6, 35.0)
-    assert ran([*drive("summer", 1, 6, 1), "--replace"])[0] == 0
+    assert run_and_read([*drive("summer", 1, 6, 1), "--replace"])[0] == 0
     assert client.admin.traverse("identity", "drive").digest == first.digest != corrected.digest
-    assert ran([*drive("winter", 2, 8, 1), "--replace"])[0] == 0
+    assert run_and_read([*drive("winter", 2, 8, 1), "--replace"])[0] == 0
     assert client.admin.traverse("identity", "drive").n_frames == 8
 
 
