@@ -42,13 +42,13 @@ WORKDIR /src
 COPY deploy deploy
 RUN python3 -m venv /opt/deepsimbad \
     && /opt/deepsimbad/bin/python -m pip install --require-hashes --requirement deploy/requirements-${VARIANT}.txt \
-    && python3 -m venv /src/build \
-    && /src/build/bin/python -m pip install --require-hashes --requirement deploy/requirements-build.txt
+    && python3 -m venv --without-pip /src/build \
+    && /opt/deepsimbad/bin/python -m pip --python /src/build install --require-hashes --requirement deploy/requirements-build.txt
 COPY pyproject.toml README.md CHANGELOG.md LICENSE ./
 COPY service service
 COPY client client
 COPY migrations migrations
-RUN /src/build/bin/python -m pip wheel --no-deps --no-build-isolation --wheel-dir /src/wheel . \
+RUN /opt/deepsimbad/bin/python -m pip --python /src/build wheel --no-deps --no-build-isolation --wheel-dir /src/wheel . \
     && /opt/deepsimbad/bin/python -m pip install --no-deps /src/wheel/*.whl \
     && /opt/deepsimbad/bin/python -m pip uninstall --yes --quiet pip setuptools
 # The hot loops are compiled, and the default network is made ready, here rather than in front of the first robot. numba

@@ -208,6 +208,7 @@ def image():
             **{name: value for name, value in os.environ.items() if name.startswith("PIP_")},
             # Half of an installation's time is compiling modules that no test imports (the option is spelt so).
             "PIP_NO_COMPILE": "false",
+            "NUMBA_OPT": "0",  # loops are compiled as the image's are, and no test here is in a hurry
         }
         given = {"PIP_EXTRA_INDEX_URL": environment.pop("PIP_EXTRA_INDEX_URL", "")}
         build = Build(STAGES, context_of(PROJECT, folder / "context"), folder, MOVED, environment, given)
