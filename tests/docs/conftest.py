@@ -70,24 +70,24 @@ class Workplace:
     def run(self, text, *program):
         """Run a line of the shell, or a text by a program; returns what it printed, which is no failure's."""
         fails = "" if EXPECTED_TO_FAIL in text or program else 'curl() { command curl -sS --fail-with-body "$@"; }\n'
-        here = text
-        for there, word in {"http://127.0.0.1:8000": self.url, **self.words}.items():
-            here = here.replace(there, str(word))
+        command_text = text
+        for original, word in {"http://127.0.0.1:8000": self.url, **self.words}.items():
+            command_text = command_text.replace(original, str(word))
         environment = {"DEEPSIMBAD_URL": self.url}
         if (key := self.folder / "operator.key").is_file():
             environment["DEEPSIMBAD_API_KEY"] = key.read_text().strip()
         if is_plain(text) and not program:
-            plain = run_command(here, self.folder, **environment)
+            plain = run_command(command_text, self.folder, **environment)
             assert plain.code == 0, f"{text}\n{plain.out}{plain.err}"
             self.output[text] = plain.out
             return plain.out
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         options = {"cwd": self.folder, "env": {**os.environ, "PATH": path, **environment}, "timeout": 400}
-        command = [*(program or ("bash", "-c")), fails + here]
-        ended = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, **options)
-        assert ended.returncode == 0, f"{text}\n{ended.stdout}{ended.stderr}"
-        self.output[text] = ended.stdout
-        return ended.stdout
+        command = [*(program or ("bash", "-c")), fails + command_text]
+        process = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, **options)
+        assert process.returncode == 0, f"{text}\n{process.stdout}{process.stderr}"
+        self.output[text] = process.stdout
+        return process.stdout
 
     def answer_of(self, part):
         """What the one command printed that holds these words."""

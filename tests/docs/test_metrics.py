@@ -54,12 +54,12 @@ def explained():
 def test_every_metric_is_explained_with_its_labels_and_no_other(metrics, kinds, explained):
     assert len(kinds) > 25
     assert {name: kind for name, (kind, _) in explained.items()} == kinds
-    shown = {}
+    labels_of = {}
     for name, labels in re.findall(r"^((?:deepsimbad|process)_\w+?)(?:\{(.*)\})? \S+$", metrics, re.MULTILINE):
-        given = set(re.findall(r'(\w+)="', labels)) - {"le"}
-        shown.setdefault(OF_HISTOGRAMS.sub("", name), set()).update(given)
-    assert len(shown) > 20
-    assert shown == {name: explained[name][1] for name in shown}
+        names = set(re.findall(r'(\w+)="', labels)) - {"le"}
+        labels_of.setdefault(OF_HISTOGRAMS.sub("", name), set()).update(names)
+    assert len(labels_of) > 20
+    assert labels_of == {name: explained[name][1] for name in labels_of}
 
 
 def test_alarms_look_at_metrics_and_labels_that_exist(kinds, explained):
@@ -99,13 +99,13 @@ def messages_of(source):
 
 def test_every_log_line_is_explained_with_its_level_and_no_other():
     table = PAGE.text.split("### Log lines")[1].split("### Metrics")[0]
-    explained, written = {}, {}
+    explained_levels, logged_levels = {}, {}
     for first, second in re.findall(r"^\| (`[^|]*) \| ([A-Z, ]+) \|", table, re.MULTILINE):
         messages, levels = re.findall(r"`([^`]+)`", first), second.split(", ")  # one level for all, or one for each
-        explained |= dict(zip(messages, levels if len(levels) > 1 else levels * len(messages), strict=True))
+        explained_levels |= dict(zip(messages, levels if len(levels) > 1 else levels * len(messages), strict=True))
     for path in (PROJECT / "service" / "deepsimbad").rglob("*.py"):
-        written |= messages_of(path.read_text(encoding="utf-8"))
-    assert len(written) > 30
-    assert explained == written
+        logged_levels |= messages_of(path.read_text(encoding="utf-8"))
+    assert len(logged_levels) > 30
+    assert explained_levels == logged_levels
     source = 'log.info("a" if b else "c", extra={"d": 1})\n_log.exception("e: %s", f)\nlog.isEnabledFor("g")'
     assert messages_of(source) == {"a": "INFO", "c": "INFO", "e": "ERROR"}

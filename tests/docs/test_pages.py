@@ -69,8 +69,8 @@ def test_the_session_is_begun_moved_on_and_ended(workplace):
     first = json.loads(workplace.answer_of('/observations"'))
     second = json.loads(workplace.answer_of("observations?action_m=0"))
     assert (first["n_observations"], second["n_observations"]) == (1, 2)
-    same = pytest.approx(first["belief"]["entropy_bits"], abs=0.3)
-    assert second["belief"]["entropy_bits"] == same, "the same view again, standing still, tells nothing new"
+    first_bits = pytest.approx(first["belief"]["entropy_bits"], abs=0.3)
+    assert second["belief"]["entropy_bits"] == first_bits, "the same view again, standing still, tells nothing new"
     assert 0 < second["belief"]["off_route"] < 0.5
     assert second["next_best_view"]["stop"] == second["belief"]["confident"]
     assert json.loads(workplace.answer_of("/next-best-view")) == second["next_best_view"]

@@ -44,26 +44,26 @@ def unnamed(path):
 
 def test_every_make_target_named_is_there(pages):
     targets = set(re.findall(r"^([a-z]+):", (PROJECT / "Makefile").read_text(), re.MULTILINE))
-    named = {word for page in pages for word in re.findall(r"\bmake ([a-z]+)", "\n".join(page.commands()))}
-    assert named >= {"demo", "test", "bench", "help"}
-    assert named <= targets
+    mentioned_targets = {word for page in pages for word in re.findall(r"\bmake ([a-z]+)", "\n".join(page.commands()))}
+    assert mentioned_targets >= {"demo", "test", "bench", "help"}
+    assert mentioned_targets <= targets
 
 
 def test_every_call_named_is_served_and_every_call_is_in_the_table(pages, calls):
-    named = {
+    mentioned_calls = {
         (method, unnamed(path))
         for page in pages
         for method, path in re.findall(rf"\b({METHODS}) (/[\w./{{}}-]*)", page.text)
     }
-    assert named <= calls, f"not served: {sorted(named - calls)}"
+    assert mentioned_calls <= calls, f"not served: {sorted(mentioned_calls - calls)}"
     text = (PROJECT / "docs" / "http.md").read_text()
     described = {(method, unnamed(path)) for method, path in re.findall(rf"`({METHODS}) (/[^`]*)`", text)}
     assert calls <= described, f"not described: {sorted(calls - described)}"
 
 
 def test_every_variable_named_is_a_setting_and_every_setting_is_named(pages):
-    named = {word for page in pages for word in re.findall(r"DEEPSIMBAD_[A-Z_]+", page.text)}
-    assert named == set(settings_by_variable()) | OTHER_VARIABLES
+    variables = {word for page in pages for word in re.findall(r"DEEPSIMBAD_[A-Z_]+", page.text)}
+    assert variables == set(settings_by_variable()) | OTHER_VARIABLES
     assert set(settings_by_variable()) <= set(
         re.findall(r"^\| `(DEEPSIMBAD_[A-Z_]+)`", SETTINGS_PAGE.text, re.MULTILINE)
     )
@@ -88,9 +88,9 @@ def test_the_settings_file_shown_is_one(tmp_path):
 @cache
 def help_of(program, *command):
     group = {"deepsimbad": deepsimbad, "deepsimbad-client": deepsimbad_client}[program]
-    ran = CliRunner().invoke(group, [*command, "--help"])
-    assert ran.exit_code == 0, f"{program} has no command {' '.join(command)}"
-    return ran.output
+    result = CliRunner().invoke(group, [*command, "--help"])
+    assert result.exit_code == 0, f"{program} has no command {' '.join(command)}"
+    return result.output
 
 
 def test_every_command_named_exists_and_has_the_options_shown(pages):
@@ -101,25 +101,25 @@ def test_every_command_named_exists_and_has_the_options_shown(pages):
             if not words:
                 continue
             depth = 3 if words[1] in {"experiment", "keys", "weights"} else 2
-            shown = help_of(words[0], *words[1:depth])
+            help_text = help_of(words[0], *words[1:depth])
             for option in (word for word in words if word.startswith("--")):
-                assert re.search(rf"{option}\b", shown), f"{page.path.name}: {text}: no option {option}"
+                assert re.search(rf"{option}\b", help_text), f"{page.path.name}: {text}: no option {option}"
                 n_options += 1
     assert n_options > 20
 
 
-def told(command):
+def help_texts(command):
     """Every option of a command and of those below it, with what its help says; and what lists say of the command."""
     for below in getattr(command, "list_commands", lambda _: ())(click.Context(command)):
-        yield from told(command.get_command(click.Context(command), below))
+        yield from help_texts(command.get_command(click.Context(command), below))
     yield command.name, command.get_short_help_str(200)
     yield from ((f"{command.name} {it.opts[0]}", it.help) for it in command.params if isinstance(it, click.Option))
 
 
 def test_every_option_says_what_it_is_for():
-    for about, text in (*told(deepsimbad), *told(deepsimbad_client)):
-        assert text, f"{about} says nothing"
-        assert not re.search(r"\b[A-Z][a-z]{1,2}\.$", text), f"{about} is cut off behind an abbreviation: {text}"
+    for name, text in (*help_texts(deepsimbad), *help_texts(deepsimbad_client)):
+        assert text, f"{name} says nothing"
+        assert not re.search(r"\b[A-Z][a-z]{1,2}\.$", text), f"{name} is cut off behind an abbreviation: {text}"
 
 
 def test_every_module_extra_link_and_file_named_is_there(pages):
@@ -141,11 +141,11 @@ def test_every_module_extra_link_and_file_named_is_there(pages):
 
 
 def test_the_figures_shown_are_the_measured_ones(readme):
-    measured = (PROJECT / "docs" / "results" / "composed.md").read_text().splitlines()
+    result_lines = (PROJECT / "docs" / "results" / "composed.md").read_text().splitlines()
     rows = r"^\| (?:composed|standardised|rrf|brute_force|brute_force_u) \|.*$"
-    shown = re.findall(rows, (PROJECT / "docs" / "methods.md").read_text(), re.MULTILINE)
-    assert len(shown) == 5
-    assert [row for row in shown if row not in measured] == []
+    table = re.findall(rows, (PROJECT / "docs" / "methods.md").read_text(), re.MULTILINE)
+    assert len(table) == 5
+    assert [row for row in table if row not in result_lines] == []
     assert "docs/results/composed.md" in readme.prose
     assert re.findall(r"\d\.\d+ %", readme.text) == [], "figures of accuracy stand in the results"
 

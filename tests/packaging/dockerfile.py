@@ -31,7 +31,7 @@ class Stage(list[Instruction]):
     def every(self, word):
         return [instruction for instruction in self if instruction.word == word]
 
-    def one(self, word):
+    def rest_of(self, word):
         """The rest of the only instruction of that word."""
         (instruction,) = self.every(word)
         return instruction.rest
@@ -76,19 +76,19 @@ def context_of(project, into):
 class Build:
     """Does stages, one after the other, below a folder that stands for the image's root.
 
-    The absolute paths of the image that are `moved` lie below the folder; every command sees the `environment` besides
-    the stage's own; build arguments that are `given` stand in the place of their defaults.
+    The absolute paths of the image that are `moved_paths` lie below the folder; every command sees the `environment` besides
+    the stage's own; build `arguments` that are given stand in the place of their defaults.
     """
 
-    def __init__(self, stages, context, folder, moved, environment, given):
+    def __init__(self, stages, context, folder, moved_paths, environment, arguments):
         self._stages, self._context, self._folder = stages, context, folder
-        self._environment, self._given = environment, given
-        self._moved = re.compile(rf"(?<![\w.-])(?=(?:{'|'.join(map(re.escape, moved))})(?![\w-]))")
+        self._environment, self._arguments = environment, arguments
+        self._moved_paths = re.compile(rf"(?<![\w.-])(?=(?:{'|'.join(map(re.escape, moved_paths))})(?![\w-]))")
         self.root, self.env = folder / "root", {}
 
-    def here(self, text):
+    def moved_text(self, text):
         """The text with the image's paths moved."""
-        return self._moved.sub(str(self.root), text)
+        return self._moved_paths.sub(str(self.root), text)
 
     def do(self, name):
         """Do a stage; from then on `root` is what it left and `env` what it set."""
@@ -99,19 +99,21 @@ class Build:
         for instruction in self._stages[name]:
             match instruction.word:
                 case "ARG":
-                    self.env |= {name: self._given.get(name, value) for name, value in pairs(instruction.rest).items()}
+                    self.env |= {
+                        name: self._arguments.get(name, value) for name, value in pairs(instruction.rest).items()
+                    }
                 case "ENV":
-                    self.env |= pairs(self.here(instruction.rest))
+                    self.env |= pairs(self.moved_text(instruction.rest))
                 case "WORKDIR":
                     workdir = self.root / PurePosixPath(instruction.rest).relative_to("/")
                     workdir.mkdir(parents=True, exist_ok=True)
                 case "COPY":
                     self._copy(instruction, workdir)
                 case "RUN":
-                    command, options = self.here(instruction.rest), {"capture_output": True, "text": True}
+                    command, options = self.moved_text(instruction.rest), {"capture_output": True, "text": True}
                     options |= {"cwd": workdir, "env": {**self._environment, **self.env}}
-                    ended = subprocess.run(["/bin/sh", "-c", command], check=False, **options)
-                    assert ended.returncode == 0, f"{instruction.rest}\n{ended.stdout}\n{ended.stderr}"
+                    process = subprocess.run(["/bin/sh", "-c", command], check=False, **options)
+                    assert process.returncode == 0, f"{instruction.rest}\n{process.stdout}\n{process.stderr}"
 
     def _copy(self, instruction, workdir):
         *sources, target = instruction.rest.split()

@@ -33,8 +33,8 @@ STAGES = stages_of(PROJECT / "Dockerfile")
 FINAL = STAGES["service"]
 COMPOSE: dict[str, Any] = yaml.safe_load((PROJECT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
-PORT = FINAL.one("EXPOSE")
-ENVIRONMENT = pairs(FINAL.one("ENV"))
+PORT = FINAL.rest_of("EXPOSE")
+ENVIRONMENT = pairs(FINAL.rest_of("ENV"))
 ABOUT = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
 MOVED = ["/opt/deepsimbad", "/var/lib/deepsimbad", "/src"]
 WAIT_S = 60.0
@@ -52,17 +52,17 @@ def test_the_image_is_what_it_says_and_runs_without_root(tmp_path):
     assert {path.name for path in context.iterdir()} == copied, "the context holds no more than is copied"
     assert not list(context.rglob("__pycache__"))
 
-    assert FINAL.one("USER") == "10001:10001"
+    assert FINAL.rest_of("USER") == "10001:10001"
     assert not FINAL.every("RUN"), "the last stage holds what was copied and nothing else"
     assert {copy.options.get("chown") for copy in FINAL.every("COPY")} == {None, "10001:10001"}
-    assert json.loads(FINAL.one("ENTRYPOINT")) == ["/opt/deepsimbad/bin/deepsimbad"]
-    assert json.loads(FINAL.one("CMD")) == ["serve"]
-    volume = FINAL.one("VOLUME")
-    assert FINAL.one("WORKDIR") == volume
+    assert json.loads(FINAL.rest_of("ENTRYPOINT")) == ["/opt/deepsimbad/bin/deepsimbad"]
+    assert json.loads(FINAL.rest_of("CMD")) == ["serve"]
+    volume = FINAL.rest_of("VOLUME")
+    assert FINAL.rest_of("WORKDIR") == volume
     assert all(ENVIRONMENT[name].startswith(volume) for name in ("DEEPSIMBAD_DATA_DIR", "NUMBA_CACHE_DIR", "HOME"))
     assert ENVIRONMENT["DEEPSIMBAD_PORT"] == PORT
-    labels = {name.rpartition(".")[2]: value for name, value in pairs(FINAL.one("LABEL")).items()}
-    assert pairs(FINAL.one("ARG")) == {"VERSION": ABOUT["version"]}
+    labels = {name.rpartition(".")[2]: value for name, value in pairs(FINAL.rest_of("LABEL")).items()}
+    assert pairs(FINAL.rest_of("ARG")) == {"VERSION": ABOUT["version"]}
     assert (labels["licenses"], labels["version"]) == (ABOUT["license"], "${VERSION}")
     assert (PROJECT / labels["documentation"]).is_file()
 
@@ -79,7 +79,7 @@ def test_compose_agrees_with_the_image():
     assert service["image"] == f"{ABOUT['name']}:{ABOUT['version']}"
     assert set(service["build"]["args"]) <= {"VARIANT"}
     assert [port.split(":") for port in service["ports"]] == [["127.0.0.1", "8000", PORT]]
-    assert [volume.split(":")[1] for volume in service["volumes"]] == [FINAL.one("VOLUME")]
+    assert [volume.split(":")[1] for volume in service["volumes"]] == [FINAL.rest_of("VOLUME")]
     for name, entry in SERVICES.items():
         assert entry["read_only"], name
         assert entry["security_opt"] == ["no-new-privileges:true"], name
@@ -102,8 +102,8 @@ def test_the_proxy_asks_the_service():
     assert f"{{$DEEPSIMBAD_UPSTREAM:deepsimbad:{PORT}}}" in config
     limits = {int(n) << {"MiB": 20, "GiB": 30}[unit] for n, unit in re.findall(r"max_size (\d+)(\wiB)", config)}
     assert limits == {settings.max_image_bytes, settings.max_batch_bytes}
-    (most,) = re.findall(r"max_conns_per_host (\d+)", config)
-    assert int(most) < settings.max_connections
+    (max_connections,) = re.findall(r"max_conns_per_host (\d+)", config)
+    assert int(max_connections) < settings.max_connections
     assert SERVICES["deepsimbad"]["environment"] == {"DEEPSIMBAD_REQUIRE_KEYS": "true"}
 
 
@@ -177,15 +177,15 @@ def test_the_tools_of_prometheus_accept_what_is_deployed(command):
     program, *arguments = command.split()
     if shutil.which(program) is None:
         pytest.skip(f"{program} is not installed")
-    done = subprocess.run([program, *arguments], cwd=PROJECT / "deploy", capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    process = subprocess.run([program, *arguments], cwd=PROJECT / "deploy", capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stdout + process.stderr
 
 
 def an_interpreter():
     """A Python like the image's that the image's user may run: ours, or the system's where ours lies in a home."""
-    ours = str(Path(getattr(sys, "_base_executable", sys.executable)).resolve())
+    own_path = str(Path(getattr(sys, "_base_executable", sys.executable)).resolve())
     code = "import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))"
-    for path in (ours, "/usr/bin/python3", "/usr/local/bin/python3"):
+    for path in (own_path, "/usr/bin/python3", "/usr/local/bin/python3"):
         try:
             if subprocess.run([path, "-c", code], capture_output=True, check=False, **IMAGE_USER).returncode == 0:
                 return path
@@ -210,8 +210,8 @@ def image():
             "PIP_NO_COMPILE": "false",
             "NUMBA_OPT": "0",  # loops are compiled as the image's are, and no test here is in a hurry
         }
-        given = {"PIP_EXTRA_INDEX_URL": environment.pop("PIP_EXTRA_INDEX_URL", "")}
-        build = Build(STAGES, context_of(PROJECT, folder / "context"), folder, MOVED, environment, given)
+        arguments = {"PIP_EXTRA_INDEX_URL": environment.pop("PIP_EXTRA_INDEX_URL", "")}
+        build = Build(STAGES, context_of(PROJECT, folder / "context"), folder, MOVED, environment, arguments)
         build.do("build")
         build.do("service")
         yield build
@@ -219,12 +219,12 @@ def image():
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def as_the_user(build, words, **more):
+def as_the_user(build, words, **variables):
     """How one of the image's commands is run."""
     return {
-        "args": [build.here(word) for word in words],
+        "args": [build.moved_text(word) for word in words],
         "cwd": build.root / "var/lib/deepsimbad",
-        "env": {**build.env, "PATH": f"{build.root}/opt/deepsimbad/bin:/usr/bin:/bin", **more},
+        "env": {**build.env, "PATH": f"{build.root}/opt/deepsimbad/bin:/usr/bin:/bin", **variables},
         "text": True,
         **IMAGE_USER,
     }
@@ -243,8 +243,8 @@ def test_the_image_serves_and_holds_no_more_than_it_needs(image):
     n_bytes = sum(path.lstat().st_size for path in (image.root / "opt").rglob("*"))
     assert n_bytes < 1800e6, f"{n_bytes / 1e6:.0f} MB: nearly half of it is PyTorch"
 
-    entry, serve = json.loads(FINAL.one("ENTRYPOINT")), json.loads(FINAL.one("CMD"))
-    health = json.loads(FINAL.one("HEALTHCHECK").removeprefix("CMD "))
+    entry, serve = json.loads(FINAL.rest_of("ENTRYPOINT")), json.loads(FINAL.rest_of("CMD"))
+    health = json.loads(FINAL.rest_of("HEALTHCHECK").removeprefix("CMD "))
     port = free_port()
 
     def run(*words):

@@ -23,9 +23,9 @@ pytestmark = pytest.mark.slow
 
 
 def run(*command, **options):
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, **options)
-    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    process = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, **options)
+    assert process.returncode == 0, f"{command} ended with {process.returncode}:\n{process.stdout}\n{process.stderr}"
+    return process.stdout
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_the_clients_commands_need_nothing_beside_their_extra():
     ("command", "extra"), [(("deepsimbad-client", "domains"), "replay"), (("deepsimbad", "info", "campus"), "service")]
 )
 def test_the_commands_of_the_bare_wheel_say_what_they_lack_in_one_line(bare, command, extra):
-    done = subprocess.run([bare / command[0], *command[1:]], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert f"pip install 'deep-simbad[{extra}]'" in done.stderr
+    process = subprocess.run([bare / command[0], *command[1:]], capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stdout) == (1, "")
+    assert len(process.stderr.splitlines()) == 1, process.stderr
+    assert f"pip install 'deep-simbad[{extra}]'" in process.stderr

@@ -65,8 +65,8 @@ def received(port, *pieces):
             pass
         answer = b""
         try:
-            while more := connection.recv(65536):
-                answer += more
+            while part := connection.recv(65536):
+                answer += part
         except ConnectionError:
             pass
         return answer
@@ -78,9 +78,9 @@ def head(port, line, *headers):
 
 def test_the_configuration_is_valid_and_written_as_its_tool_writes_it():
     for arguments in (("validate", "--adapter", "caddyfile", "--config", CADDYFILE), ("fmt", CADDYFILE)):
-        ran = subprocess.run([str(CADDY), *arguments], capture_output=True, text=True, check=False)
-        assert ran.returncode == 0, ran.stderr
-    assert ran.stdout == CADDYFILE.read_text()
+        process = subprocess.run([str(CADDY), *arguments], capture_output=True, text=True, check=False)
+        assert process.returncode == 0, process.stderr
+    assert process.stdout == CADDYFILE.read_text()
 
 
 def test_what_the_service_answers_passes_through(port):
@@ -99,12 +99,14 @@ def test_what_the_service_answers_passes_through(port):
 
 
 @pytest.mark.parametrize(
-    "begun", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nA: b\r\n"], ids=["silent", "line", "header"]
+    "head_start",
+    [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nA: b\r\n"],
+    ids=["silent", "line", "header"],
 )
-def test_a_head_that_never_ends_is_ended(port, begun):
-    began = time.monotonic()
-    assert b"200 OK" not in received(port, begun)
-    assert time.monotonic() - began < 30
+def test_a_head_that_never_ends_is_ended(port, head_start):
+    start_s = time.monotonic()
+    assert b"200 OK" not in received(port, head_start)
+    assert time.monotonic() - start_s < 30
 
 
 def test_a_body_that_never_ends_is_ended(port):
@@ -114,8 +116,8 @@ def test_a_body_that_never_ends_is_ended(port):
 
 
 def test_a_body_that_is_too_long_is_ended_however_it_comes(port):
-    sent = head(port, "PUT /v1/admin/domains/d", "Content-Type: image/png", "Transfer-Encoding: chunked")
-    answer = received(port, sent, *[b"100000\r\n" + bytes(1 << 20) + b"\r\n"] * 40)
+    request_head = head(port, "PUT /v1/admin/domains/d", "Content-Type: image/png", "Transfer-Encoding: chunked")
+    answer = received(port, request_head, *[b"100000\r\n" + bytes(1 << 20) + b"\r\n"] * 40)
     assert not answer.startswith(b"HTTP/1.1 2")
 
 
