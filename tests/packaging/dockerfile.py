@@ -76,8 +76,8 @@ def context_of(project, into):
 class Build:
     """Does stages, one after the other, below a folder that stands for the image's root.
 
-    The absolute paths of the image that are `moved_paths` lie below the folder; every command sees the `environment` besides
-    the stage's own; build `arguments` that are given stand in the place of their defaults.
+    `moved_paths`, absolute ones of the image, lie below the folder; every command sees the `environment` besides the
+    stage's own; build `arguments` stand in the place of their defaults.
     """
 
     def __init__(self, stages, context, folder, moved_paths, environment, arguments):
