@@ -170,35 +170,35 @@ async def test_bodies_on_their_way_and_answers_read_slowly_take_nobodys_turn():
 
 async def test_bodies_that_fill_the_memory():
     door = Asker(max_requests=10)
-    first = await door.ask(method="PUT", transfer_encoding="chunked")
+    first_exchange = await door.ask(method="PUT", transfer_encoding="chunked")
     for n_bytes, n_held in ((FREE_BYTES, 0), (300, 300), (300, 600)):
-        first.push(n_bytes, has_more=True)
+        first_exchange.push(n_bytes, has_more=True)
         await settle()
         assert door.in_use[1] == n_held
     # One that says that it will not fit is refused before a byte of it ...
-    declared = await door.ask(method="PUT", n_declared=FREE_BYTES + 401)
-    assert (declared.limit, declared.n_read) == ("max_body_memory_bytes", 0)
+    large_exchange = await door.ask(method="PUT", n_declared=FREE_BYTES + 401)
+    assert (large_exchange.limit, large_exchange.n_read) == ("max_body_memory_bytes", 0)
     # ... one that fits takes its room as it comes, and small ones always fit.
-    fits = await door.ask(method="PUT", n_declared=FREE_BYTES + 400)
-    small = await door.ask(method="PUT", n_declared=FREE_BYTES)
-    small.push(FREE_BYTES)
+    fitting_exchange = await door.ask(method="PUT", n_declared=FREE_BYTES + 400)
+    small_exchange = await door.ask(method="PUT", n_declared=FREE_BYTES)
+    small_exchange.push(FREE_BYTES)
     assert door.in_use[1] == 600
     # What comes in chunks is refused by the chunk that is too much.
-    chunked = await door.ask(method="PUT", transfer_encoding="chunked")
-    chunked.push(FREE_BYTES + 400, has_more=True)
+    chunked_exchange = await door.ask(method="PUT", transfer_encoding="chunked")
+    chunked_exchange.push(FREE_BYTES + 400, has_more=True)
     await settle()
-    assert chunked.status is None
-    chunked.push(1, has_more=True)
+    assert chunked_exchange.status is None
+    chunked_exchange.push(1, has_more=True)
     await settle()
-    assert (chunked.limit, door.in_use[1]) == ("max_body_memory_bytes", 600)
+    assert (chunked_exchange.limit, door.in_use[1]) == ("max_body_memory_bytes", 600)
     # A batch goes to the disk.
-    batch = await door.ask(BATCH, "POST", n_declared=10_000_000)
-    batch.push(10_000_000)
+    batch_exchange = await door.ask(BATCH, "POST", n_declared=10_000_000)
+    batch_exchange.push(10_000_000)
     await settle()
-    assert (batch.status, door.in_use[1]) == (None, 600)
-    for exchange in (first, fits):
+    assert (batch_exchange.status, door.in_use[1]) == (None, 600)
+    for exchange in (first_exchange, fitting_exchange):
         exchange.incoming.put_nowait(LEFT)
-    for exchange in (small, batch):
+    for exchange in (small_exchange, batch_exchange):
         exchange.may_answer.set()
     await settle()
     assert door.in_use == (0, 0)
@@ -207,14 +207,14 @@ async def test_bodies_that_fill_the_memory():
 @pytest.mark.filterwarnings("default::ResourceWarning")
 async def test_nothing_is_kept_by_what_breaks_or_is_cancelled():
     door = Asker()
-    broken = await door.ask("/breaks", method="PUT", n_declared=FREE_BYTES + 5)
-    broken.push(FREE_BYTES + 5)
-    cancelled = await door.ask(BATCH, "POST", n_declared=5)
+    broken_exchange = await door.ask("/breaks", method="PUT", n_declared=FREE_BYTES + 5)
+    broken_exchange.push(FREE_BYTES + 5)
+    cancelled_exchange = await door.ask(BATCH, "POST", n_declared=5)
     await settle()
     door.tasks[1].cancel()
     await asyncio.gather(*door.tasks)
-    broken.problem(500, "internal_error")
-    assert cancelled.problem(503, "unavailable")["detail"] == "the service is shutting down"
+    broken_exchange.problem(500, "internal_error")
+    assert cancelled_exchange.problem(503, "unavailable")["detail"] == "the service is shutting down"
     assert door.in_use == (0, 0)
 
 
@@ -245,8 +245,8 @@ async def test_a_body_at_the_limit_passes_and_one_over_it_is_refused_at_the_byte
 )
 async def test_a_declared_length_over_the_limit_never_reaches_the_application(path, content_type, limit):
     door = Asker(max_json_bytes=100, max_image_bytes=200, max_batch_bytes=300)
-    over = await door.ask(path, "POST", n_declared=limit + 1, content_type=content_type)
-    assert (over.problem(413, "body_too_large")["max_bytes"], over.n_read) == (limit, 0)
+    exchange = await door.ask(path, "POST", n_declared=limit + 1, content_type=content_type)
+    assert (exchange.problem(413, "body_too_large")["max_bytes"], exchange.n_read) == (limit, 0)
     assert (await door.ask(path, "POST", n_declared=limit, content_type=content_type)).status is None
 
 
@@ -280,12 +280,16 @@ async def test_scopes(catalog):
         exchange = await door.answered(path, authorization=bearer(key))
         assert exchange.status == 200, path
     assert exchange.scope["state"]["key_id"] == record.key_id
-    refused = await door.ask("/v1/admin/jobs", authorization=bearer(robot))
-    assert refused.problem(403, "forbidden")["needed"] == "admin"
-    unread = await door.ask("/v1/admin/domains/a", "PUT", n_declared=1000, x_api_key="dsk_x")
-    unread.push(1000)
-    unread.problem(401, "unauthorized")
-    assert (unread.n_read, unread.incoming.qsize(), unread.headers["www-authenticate"]) == (0, 1, "Bearer")
+    forbidden_exchange = await door.ask("/v1/admin/jobs", authorization=bearer(robot))
+    assert forbidden_exchange.problem(403, "forbidden")["needed"] == "admin"
+    unread_exchange = await door.ask("/v1/admin/domains/a", "PUT", n_declared=1000, x_api_key="dsk_x")
+    unread_exchange.push(1000)
+    unread_exchange.problem(401, "unauthorized")
+    assert (unread_exchange.n_read, unread_exchange.incoming.qsize(), unread_exchange.headers["www-authenticate"]) == (
+        0,
+        1,
+        "Bearer",
+    )
     assert (await door.answered("/healthz")).status == 200
 
 
@@ -311,9 +315,9 @@ async def test_the_rate_is_counted_by_key(catalog):
     (_, key), (_, other) = (catalog.create_key(KeyScope.LOCALIZE) for _ in range(2))
     door = Asker(ring_of(catalog), rate_limit_per_s=0.5, rate_limit_burst=2)
     assert [(await door.answered(authorization=bearer(key))).status for _ in range(3)] == [200, 200, 429]
-    over = await door.ask(authorization=bearer(key))
-    over.problem(429, "rate_limited")
-    assert over.headers["retry-after"] == "2"
+    exchange = await door.ask(authorization=bearer(key))
+    exchange.problem(429, "rate_limited")
+    assert exchange.headers["retry-after"] == "2"
     assert (await door.answered(authorization=bearer(other))).status == 200
     assert (await door.answered("/readyz", authorization=bearer(key))).status == 200
 

@@ -121,7 +121,7 @@ def test_an_expired_key(catalog):
 
 def test_every_key_is_compared_known_or_not(catalog, monkeypatch):
     record, key = catalog.create_key(KeyScope.ADMIN)
-    ring, unknown = ring_of(catalog), ApiKey.new()
+    ring, unknown_key = ring_of(catalog), ApiKey.new()
     comparisons = []
     compare_digest = keys.hmac.compare_digest
 
@@ -131,9 +131,9 @@ def test_every_key_is_compared_known_or_not(catalog, monkeypatch):
 
     monkeypatch.setattr(keys.hmac, "compare_digest", watched)
     with pytest.raises(UnauthorizedError):
-        ring.holder(unknown.text)
+        ring.holder(unknown_key.text)
     ring.holder(key.text)
-    assert [sent_digest for sent_digest, _ in comparisons] == [unknown.secret_sha256, key.secret_sha256]
+    assert [sent_digest for sent_digest, _ in comparisons] == [unknown_key.secret_sha256, key.secret_sha256]
     assert {len(stored_digest) for _, stored_digest in comparisons} == {64}
     assert comparisons[1][1] == record.secret_sha256
 

@@ -92,11 +92,11 @@ def test_the_service_on_https(tmp_path):
 def test_what_is_there_at_the_start_is_not_looked_through_again():
     async def frozen_while_it_serves():
         server = _Server(uvicorn.Config(FastAPI(), port=0, lifespan="off", log_config=None), FastAPI())
-        serving = asyncio.create_task(server.serve())
+        task = asyncio.create_task(server.serve())
         while not server.started:
             await asyncio.sleep(0.01)
         server.should_exit = True
-        await serving
+        await task
         return gc.get_freeze_count()
 
     try:

@@ -79,8 +79,8 @@ def test_a_session_goes_on_anywhere_with_the_answers_of_one_service(nodes, mappe
 def test_what_was_counted_elsewhere_counts_once(nodes):
     node_a, node_b = nodes("a"), nodes("b")
     session = node_a.post("/v1/domains/ready/sessions", json={}, headers={"Idempotency-Key": "a"}).json()
-    again = node_b.post("/v1/domains/ready/sessions", json={}, headers={"Idempotency-Key": "a"})
-    assert (again.status_code, again.json()["session_id"]) == (201, session["session_id"])
+    repetition = node_b.post("/v1/domains/ready/sessions", json={}, headers={"Idempotency-Key": "a"})
+    assert (repetition.status_code, repetition.json()["session_id"]) == (201, session["session_id"])
     path = path_of(session)
     first = observe(node_a, path, 1, **{"Idempotency-Key": "b"})
     assert lasting_answer(observe(node_b, path, 1, **{"Idempotency-Key": "b"})) == lasting_answer(first)

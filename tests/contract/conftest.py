@@ -64,9 +64,9 @@ def wait_until(condition):
 
 
 def npz(**arrays):
-    packed = io.BytesIO()
-    np.savez(packed, **arrays)
-    return packed.getvalue()
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
 
 
 def picture(seed):

@@ -24,10 +24,10 @@ def _images(extension):
 
 
 def _batch(n):
-    packed = io.BytesIO()
+    file = io.BytesIO()
     encodings = np.random.default_rng(n).normal(size=(n, DIM)).astype(np.float32)
-    np.savez(packed, encodings=encodings, index=np.arange(n), position_m=np.arange(n, dtype=float))
-    return packed.getvalue()
+    np.savez(file, encodings=encodings, index=np.arange(n), position_m=np.arange(n, dtype=float))
+    return file.getvalue()
 
 
 for _type, _extension in (("jpeg", ".jpg"), ("png", ".png"), ("tiff", ".tiff"), ("webp", ".webp")):

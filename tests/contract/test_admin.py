@@ -36,9 +36,9 @@ WITHIN_S = 60
 
 def test_a_domain_is_made_once(client):
     first = client.put("/v1/admin/domains/once", json=TAKES_ENCODINGS)
-    again = client.put("/v1/admin/domains/once", json={**TAKES_ENCODINGS, "closed": False})
-    assert (first.status_code, again.status_code) == (201, 200)
-    assert first.json() == again.json() == client.get("/v1/domains/once").json()
+    repetition = client.put("/v1/admin/domains/once", json={**TAKES_ENCODINGS, "closed": False})
+    assert (first.status_code, repetition.status_code) == (201, 200)
+    assert first.json() == repetition.json() == client.get("/v1/domains/once").json()
     assert first.json()["actions_m"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
     answer = client.put("/v1/admin/domains/defaults", json={"evaluator": {"kind": "feature_l2"}})
     written_out = {"evaluator": answer.json()["evaluator"]}
@@ -115,9 +115,9 @@ def test_frames_twice_and_out_of_order(client, shelf):
         answer = client.put(f"{shelf}/t/frames/{index}", params=place, json={"encoding": [float(index)] * DIM})
         answers.append((answer.status_code, answer.json()["index"], answer.json()["n_frames"]))
     assert answers == [(201, 5, 1), (201, 0, 2), (201, 2, 3), (200, 5, 3)]
-    described = client.get(f"{shelf}/t").json()
-    assert len(described.pop("digest")) == 64
-    assert described == {
+    description = client.get(f"{shelf}/t").json()
+    assert len(description.pop("digest")) == 64
+    assert description == {
         "name": "t",
         "n_frames": 3,
         "missing": [[1, 1], [3, 4]],
@@ -145,18 +145,18 @@ def test_what_is_there_stays_where_nothing_may_be_replaced(client, shelf):
     assert answer.json() == {"n_new": 0, "n_replaced": 0, "n_frames": 3}
     encoding = {"encoding": np.eye(DIM)[1].tolist()}
     assert client.put(f"{frames}/1?position_m=1&replace=false", json=encoding).status_code == 200
-    for changed, indices, difference in (
+    for changes, indices, difference in (
         ({"position_m": np.array([0.0, 5, 6])}, [1, 2], "position"),
         ({"x_m": np.array([np.nan, 1, np.nan])}, [1], "x"),
         ({"timestamp_us": np.array([-1, -1, 7])}, [2], "time"),
         ({"encodings": np.eye(DIM)[[3, 1, 2]]}, [0], "content"),
     ):
-        batch = npz(**{**frames_there, "index": np.arange(3), **changed})
-        refused = problem(client.post(f"{frames}?replace=false", content=batch, headers=NPZ), 409, "frames_differ")
-        assert (refused["indices"], refused["n_differing"]) == (indices, len(indices))
-        assert f"differ in {difference}," in refused["detail"]
-    refused = client.put(f"{frames}/1?position_m=4&replace=false", json=encoding)
-    assert problem(refused, 409, "frames_differ")["indices"] == [1]
+        batch = npz(**{**frames_there, "index": np.arange(3), **changes})
+        response = problem(client.post(f"{frames}?replace=false", content=batch, headers=NPZ), 409, "frames_differ")
+        assert (response["indices"], response["n_differing"]) == (indices, len(indices))
+        assert f"differ in {difference}," in response["detail"]
+    response = client.put(f"{frames}/1?position_m=4&replace=false", json=encoding)
+    assert problem(response, 409, "frames_differ")["indices"] == [1]
     assert client.get(f"{shelf}/t").json() == description
     with np.load(BytesIO(client.get(frames).content)) as columns:
         assert {name: columns[name].tolist() for name in ("index", "position_m", "timestamp_us")} == {

@@ -370,13 +370,13 @@ def test_an_unknown_word_is_answered_with_the_nearest_and_with_what_there_is(cli
 def test_a_query_parameter_that_a_call_does_not_take_is_refused_by_every_one(client):
     document = client.get("/openapi.json").json()
     for method, path, *_ in operations(document):
-        refused = problem(client.request(method, f"{path.format(**NAMES)}&shortlis=3"), 422, "unknown_parameter")
-        assert refused["unknown"] == ["shortlis"]
+        refusal = problem(client.request(method, f"{path.format(**NAMES)}&shortlis=3"), 422, "unknown_parameter")
+        assert refusal["unknown"] == ["shortlis"]
         parameters = document["paths"][path.partition("?")[0]][method.lower()].get("parameters", ())
-        assert sorted(refused["allowed"]) == sorted(
+        assert sorted(refusal["allowed"]) == sorted(
             parameter["name"] for parameter in parameters if parameter["in"] == "query"
         )
-        assert ("did you mean shortlist?" in refused["detail"]) == ("shortlist" in refused["allowed"])
+        assert ("did you mean shortlist?" in refusal["detail"]) == ("shortlist" in refusal["allowed"])
     session = client.session()
     problem(client.post(f"{session}/observations?action_m=3&shortlis=3", json=RANKS), 422, "unknown_parameter")
     assert client.get(session).json()["n_observations"] == 0
@@ -408,8 +408,8 @@ def test_remaps_that_fail_leave_the_map_that_serves(client):
         ({"training_traverse": "backwards", "relevance": "rrf"}, "the number of landmarks, 2"),
         ({"training_traverse": "backwards", "append": True, "list_length": 3}, "what is appended to it must be alike"),
     ):
-        refused = problem(client.post(f"{ADMIN}/remaps", json={**REMAP, **options}), 422, "invalid_map_config")
-        assert complaint in refused["detail"]
+        document = problem(client.post(f"{ADMIN}/remaps", json={**REMAP, **options}), 422, "invalid_map_config")
+        assert complaint in document["detail"]
     assert len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"]) == n_jobs
     too_many = {**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}
     assert problem(client.post(f"{ADMIN}/remaps", json=too_many), 422, "too_few_candidates")["n_candidates"] == N_READY
@@ -423,16 +423,16 @@ def test_a_damaged_map(client, domain, data_dir):
     place, active = f"/v1/domains/{domain}/localizations", f"/v1/admin/domains/{domain}/active-map"
     assert client.post(place, json=RANKS).status_code == 200
     client.remap(domain, activate=False)
-    sealed = data_dir / "domains" / domain / "maps" / "000002.sqlite"
-    content = bytearray(sealed.read_bytes())
+    path = data_dir / "domains" / domain / "maps" / "000002.sqlite"
+    content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
-    sealed.chmod(0o644)
-    sealed.write_bytes(content)
+    path.chmod(0o644)
+    path.write_bytes(content)
     # A damaged version never takes over ...
     problem(client.put(active, json={"version": 2, "expected": 1}), 503, "damaged_map")
     assert client.get(f"/v1/domains/{domain}").json()["map_version"] == 1
     # ... and one damaged while it was active is named, not half answered.
-    sealed.write_bytes(content[: len(content) // 3])
+    path.write_bytes(content[: len(content) // 3])
     with Catalog.open(data_dir) as catalog:
         catalog.activate(domain, 2, ANY)
     client.services.maps.forget(domain)
@@ -515,8 +515,8 @@ def test_fewer_frames_than_a_list_takes_are_refused_at_once(client, n_frames):
     base = f"/v1/admin/domains/few-{n_frames}"
     assert client.put(base, json={"evaluator": {**KIND, "extractor": "none"}}).is_success
     client.upload(f"few-{n_frames}", "drive", season(1, n_frames), np.arange(float(n_frames)))
-    refused = problem(client.post(f"{base}/remaps", json=REMAP), 422, "invalid_map_config")
-    assert "list_length 4" in refused["detail"]
+    document = problem(client.post(f"{base}/remaps", json=REMAP), 422, "invalid_map_config")
+    assert "list_length 4" in document["detail"]
     assert client.delete(base).status_code == 204
 
 

@@ -18,23 +18,23 @@ GOOD = {"encodings": np.ones((2, DIM), np.float32), "index": np.array([0, 1]), "
 
 
 def zipped(members):
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():
             archive.writestr(name, content)
-    return packed.getvalue()
+    return file.getvalue()
 
 
 def npy(array, **options):
-    packed = io.BytesIO()
-    np.lib.format.write_array(packed, array, **options)
-    return packed.getvalue()
+    file = io.BytesIO()
+    np.lib.format.write_array(file, array, **options)
+    return file.getvalue()
 
 
 def npy_header(shape):
-    packed = io.BytesIO()
-    np.lib.format.write_array_header_1_0(packed, {"descr": "<f4", "fortran_order": False, "shape": shape})
-    return packed.getvalue()
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    return file.getvalue()
 
 
 def with_encodings(content):
@@ -107,15 +107,15 @@ def test_round_trip(save):
     encodings = np.asfortranarray(np.arange(6.0).reshape(2, 3)).astype(np.float16, order="F")
     frames = {"encodings": encodings, "index": np.array([4, 1]), "position_m": np.array([2.0, 1.0])}
     places = {"timestamp_us": np.array([-1, 5]), "x_m": np.array([np.nan, 1.0]), "y_m": np.array([0, 1])}
-    packed = io.BytesIO()
-    save(packed, **frames, **places)
-    drive = read_batch(packed, 10_000).checked()
+    file = io.BytesIO()
+    save(file, **frames, **places)
+    drive = read_batch(file, 10_000).checked()
     for name, array in {**frames, **places}.items():
         np.testing.assert_array_equal(getattr(drive, name), array)
         assert getattr(drive, name).dtype.kind == ("i" if name in {"index", "timestamp_us"} else "f")
-    unknown = read_batch(io.BytesIO(npz(**frames)), 10_000).checked()
-    assert unknown.timestamp_us.tolist() == [-1, -1]
-    assert np.isnan([unknown.x_m, unknown.y_m]).all()
+    bare_drive = read_batch(io.BytesIO(npz(**frames)), 10_000).checked()
+    assert bare_drive.timestamp_us.tolist() == [-1, -1]
+    assert np.isnan([bare_drive.x_m, bare_drive.y_m]).all()
 
 
 def test_every_cut_of_a_batch_is_refused_and_any_flipped_byte_is_or_is_harmless():
@@ -126,10 +126,10 @@ def test_every_cut_of_a_batch_is_refused_and_any_flipped_byte_is_or_is_harmless(
     rng = np.random.default_rng(0)
     n_refused = 0
     for place in rng.choice(len(batch), 300):
-        broken = bytearray(batch)
-        broken[place] ^= 1 << int(rng.integers(8))
+        content = bytearray(batch)
+        content[place] ^= 1 << int(rng.integers(8))
         try:
-            read_batch(io.BytesIO(bytes(broken)), 10_000)
+            read_batch(io.BytesIO(bytes(content)), 10_000)
         except (InvalidBatchError, TooLargeError):  # no other error may come out
             n_refused += 1
     assert n_refused > 100

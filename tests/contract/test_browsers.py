@@ -1,4 +1,4 @@
-"""What browsers are told: headers on every answer, other origins where set, and a page that needs no other host."""
+"""For browsers: headers on every answer, other origins where set, and pages that need no other host."""
 
 import re
 
@@ -58,9 +58,9 @@ def test_the_page_of_the_documentation_loads_nothing_from_elsewhere(client):
     assert policy["default-src"] == policy["frame-ancestors"] == "'none'"
     assert policy["script-src"] == policy["connect-src"] == "'self'"
     assert re.findall(r"<script(?! src=)|\son\w+=|<style", page.text) == [], "such a policy runs none of these"
-    loaded = re.findall(r'(?:src|href)="(docs/[^"]+)"', page.text)
-    assert len(loaded) == 3
-    for path in loaded:
+    paths = re.findall(r'(?:src|href)="(docs/[^"]+)"', page.text)
+    assert len(paths) == 3
+    for path in paths:
         answer = client.get(f"/{path}")
         assert answer.status_code == 200
         assert answer.headers["content-type"].startswith("text/css" if path.endswith(".css") else "text/javascript")
@@ -113,11 +113,11 @@ def test_a_preflight_needs_no_key_and_the_call_itself_does(cors_client):
     assert header_names <= values_of(answer, "access-control-allow-headers")
     assert "access-control-allow-credentials" not in answer.headers
     assert EVERYWHERE.items() <= dict(answer.headers).items()
-    refused, let_in = client.get("/v1/domains"), client.get("/v1/domains", headers=key)
-    assert (refused.status_code, let_in.status_code) == (401, 200)
-    for response in (answer, refused, let_in):  # or the page could not read why
+    keyless, keyed = client.get("/v1/domains"), client.get("/v1/domains", headers=key)
+    assert (keyless.status_code, keyed.status_code) == (401, 200)
+    for response in (answer, keyless, keyed):  # or the page could not read why
         assert response.headers["access-control-allow-origin"] == ORIGIN
-    assert {"x-request-id", "retry-after", "location"} <= values_of(let_in, "access-control-expose-headers")
+    assert {"x-request-id", "retry-after", "location"} <= values_of(keyed, "access-control-expose-headers")
 
 
 def test_another_origin_is_not_let_in(cors_client):

@@ -1,4 +1,4 @@
-"""What the console is made of and asks for: its files, a session's events, a map's coverage, domains' options."""
+"""The console's files and the calls it makes: a session's events, a map's coverage, domains' options."""
 
 import json
 import re
@@ -127,16 +127,16 @@ def test_events_of_sessions_that_are_none_or_not_ones_own(tmp_path):
 
 def test_coverage_names_every_map_image_and_the_worst_stretches(client):
     answer = client.get("/v1/domains/ready/coverage").json()
-    described = client.get("/v1/domains/ready").json()
-    n = described["n_map_images"]
-    assert answer["map_version"] == described["map_version"]
+    description = client.get("/v1/domains/ready").json()
+    n = description["n_map_images"]
+    assert answer["map_version"] == description["map_version"]
     assert answer["basis"] in {"one_season", "two_seasons"}
     chance = np.array(answer["chance"])
     assert len(answer["route_position_m"]) == chance.size == len(answer["x_m"]) == n
     assert answer["x_m"][3] is None
     assert ((chance >= 0) & (chance <= 1)).all()
-    worst = [stretch["chance"] for stretch in answer["stretches"]]
-    assert worst == sorted(worst)
+    means = [stretch["chance"] for stretch in answer["stretches"]]
+    assert means == sorted(means)
     for stretch in answer["stretches"]:
         chances = chance[stretch["first_map_image"] : stretch["last_map_image"] + 1]
         assert stretch["chance"] == pytest.approx(chances.mean(), abs=1e-3)
@@ -146,15 +146,15 @@ def test_coverage_names_every_map_image_and_the_worst_stretches(client):
 
 
 def test_landmarks_are_known_by_the_frames_they_began_as(client):
-    described = client.get("/v1/domains/seen").json()
+    description = client.get("/v1/domains/seen").json()
     answer = client.get("/v1/domains/seen/landmarks").json()
     columns = [answer[name] for name in ("n_map_images", "map_image", "frame", "drive")]
-    assert {len(column) for column in columns} == {described["n_landmarks"]}
-    assert sum(answer["n_map_images"]) == described["n_map_images"] * described["list_length"]
-    assert sorted(answer["map_image"]) == list(range(described["n_map_images"])), "of its own drive, all of them"
+    assert {len(column) for column in columns} == {description["n_landmarks"]}
+    assert sum(answer["n_map_images"]) == description["n_map_images"] * description["list_length"]
+    assert sorted(answer["map_image"]) == list(range(description["n_map_images"])), "of its own drive, all of them"
     assert set(answer["drive"]) == {"drive"}
     problem(client.get("/v1/domains/seen/landmarks/0/thumbnail"), 404, "unknown_thumbnail")
-    problem(client.get(f"/v1/domains/seen/landmarks/{described['n_landmarks']}/thumbnail"), 404, "unknown_thumbnail")
+    problem(client.get(f"/v1/domains/seen/landmarks/{description['n_landmarks']}/thumbnail"), 404, "unknown_thumbnail")
     problem(client.get("/v1/domains/unmapped/landmarks"), 409, "no_active_map")
 
 
@@ -162,11 +162,11 @@ def test_what_a_domain_shows_may_be_changed_and_nothing_else(client, domain):
     path, body = f"/v1/admin/domains/{domain}", TAKES_ENCODINGS
     assert client.get(f"/v1/domains/{domain}").json()["thumbnails"] is False
     anchor = {"lat_deg": 42.29, "lon_deg": -83.71}
-    changed = client.put(path, json={**body, "thumbnails": True, "anchor": anchor})
-    assert (changed.status_code, changed.json()["thumbnails"]) == (200, True)
-    assert changed.json()["anchor"] == {**anchor, "bearing_deg": 0.0, "height_m": 0.0}
-    again = client.put(path, json=body).json()
-    assert again["thumbnails"] is True, "what is not named stays"
+    answer = client.put(path, json={**body, "thumbnails": True, "anchor": anchor})
+    assert (answer.status_code, answer.json()["thumbnails"]) == (200, True)
+    assert answer.json()["anchor"] == {**anchor, "bearing_deg": 0.0, "height_m": 0.0}
+    document = client.put(path, json=body).json()
+    assert document["thumbnails"] is True, "what is not named stays"
     assert client.put(path, json={**body, "anchor": None}).json()["anchor"] is None
     problem(client.put(path, json={**body, "closed": True, "thumbnails": False}), 409, "domain_differs")
     assert client.get(f"/v1/domains/{domain}").json()["thumbnails"] is True

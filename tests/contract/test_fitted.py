@@ -134,8 +134,8 @@ def test_a_full_spool_refuses_the_frame_and_loses_nothing(tmp_path):
         assert n_waiting(client, "small", "first")[0] == n_taken
         assert client.remap("small", training_traverse="first", training_episodes=0)["state"] == "succeeded"
         assert {answer.status_code for answer in drive(client, "small", "second", 1, n_taken)} == {201}
-        replaced = drive(client, "small", "first", 0, 1)[0]
-        assert replaced.status_code in {200, 409}
+        replacement = drive(client, "small", "first", 0, 1)[0]
+        assert replacement.status_code in {200, 409}
         assert client.delete("/v1/admin/domains/small/traverses/second").status_code == 204
         assert drive(client, "small", "first", 0, 1)[0].status_code == 200, "a deleted traverse makes room"
 

@@ -49,9 +49,9 @@ def test_a_service_is_shown_below_a_path(tmp_path):
     with service(tmp_path, root_path="/robots/simbad") as client:
         client.make_ready_domain("below")
         assert client.get("/openapi.json").json()["servers"] == [{"url": "/robots/simbad"}]
-        for given_on in ("", "/robots/simbad"):  # by proxies that take it away, and those that do not
-            assert client.get(f"{given_on}/v1/domains/below").status_code == 200
-            answer = client.post(f"{given_on}/v1/domains/below/sessions", json={})
+        for prefix in ("", "/robots/simbad"):  # by proxies that take it away, and those that do not
+            assert client.get(f"{prefix}/v1/domains/below").status_code == 200
+            answer = client.post(f"{prefix}/v1/domains/below/sessions", json={})
             assert answer.headers["location"] == f"/robots/simbad/v1/sessions/{answer.json()['session_id']}"
             assert client.get(answer.headers["location"]).status_code == 200
         job = client.post("/v1/admin/domains/below/remaps", json={"training_traverse": "drive"})

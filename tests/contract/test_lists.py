@@ -89,21 +89,21 @@ def test_what_is_made_or_goes_meanwhile_moves_nothing(client):
 
 
 def test_a_listed_session_is_the_session(client, domain):
-    old, new = client.session(domain), client.session(domain)
+    old_path, new_path = client.session(domain), client.session(domain)
     for _ in range(2):
-        client.post(f"{old}/observations", json=RANKS)
-    client.put(f"{old}/prior", json={"position_m": 10, "std_m": 2})
-    state = client.get(old).json()
+        client.post(f"{old_path}/observations", json=RANKS)
+    client.put(f"{old_path}/prior", json={"position_m": 10, "std_m": 2})
+    state = client.get(old_path).json()
     sessions = page(client, f"/v1/admin/sessions?domain={domain}")["sessions"]
-    assert [path_of(session) for session in sessions] == [new, old]
+    assert [path_of(session) for session in sessions] == [new_path, old_path]
     assert sessions[1]["created_at"] < sessions[1]["expires_at"] == state["expires_at"]
     for member in ("domain", "map_version", "n_observations"):
         assert sessions[1][member] == state[member]
     assert (sessions[0]["n_observations"], sessions[1]["n_observations"]) == (0, 2)
     assert sessions[1] in entries(client, "/v1/admin/sessions", "sessions", 7)
-    client.delete(old)
+    client.delete(old_path)
     sessions = page(client, f"/v1/admin/sessions?domain={domain}")["sessions"]
-    assert [path_of(session) for session in sessions] == [new]
+    assert [path_of(session) for session in sessions] == [new_path]
 
 
 @OF_FULL

@@ -24,7 +24,7 @@ from .conftest import (
 READY = "/v1/domains/ready/localizations"
 
 
-def localized(client, body=RANKS, shortlist=10, of="ready"):
+def localize(client, body=RANKS, shortlist=10, of="ready"):
     answer = client.post(f"/v1/domains/{of}/localizations", params={"shortlist": shortlist}, json=body)
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/json"
@@ -34,7 +34,7 @@ def localized(client, body=RANKS, shortlist=10, of="ready"):
 
 
 def test_the_answer_has_every_member_of_the_contract(client):
-    answer = localized(client)
+    answer = localize(client)
     assert set(answer) == {
         *("map_version", "timings_ms", "belief", "retrieval", "next_best_view", "informative", "warnings")
     }
@@ -70,11 +70,11 @@ def test_the_answer_has_every_member_of_the_contract(client):
 def test_a_map_frames_own_encoding_is_found_again_and_unknown_coordinates_are_null(client):
     hits = 0
     for index, encoding in enumerate(ready_encodings()):
-        (best,) = localized(client, {"encoding": encoding.tolist()}, 1)["retrieval"]
+        (best,) = localize(client, {"encoding": encoding.tolist()}, 1)["retrieval"]
         hits += best["map_image"] == index
         assert best["route_position_m"] == 2.0 * best["map_image"]
     assert hits >= 0.8 * N_READY  # a list of 4 among 10 landmarks does not tell all 40 apart
-    top = {place["map_image"]: place for place in localized(client, shortlist=N_READY)["belief"]["top"]}
+    top = {place["map_image"]: place for place in localize(client, shortlist=N_READY)["belief"]["top"]}
     assert len(top) == N_READY
     assert (top[3]["x_m"], top[4]["x_m"], top[4]["y_m"]) == (None, 8.0, -4.0)
     assert (top[3]["frame"], top[4]["frame"], best["frame"]) == (None, "4.png", f"{best['map_image']}.png")
@@ -125,26 +125,26 @@ def test_images_of_all_types_are_found_again(client, kind):
 
 
 def test_dissimilarities_by_the_served_landmark_model_are_answered_as_the_encoding_is(client):
-    """As a robot computes them: squared distances between unit vectors of what is standardised."""
+    """A robot computes them as squared distances between unit vectors of standardised encodings."""
     model = np.load(io.BytesIO(client.get("/v1/domains/ready/landmark-model").content), allow_pickle=False)
     mean, std = model["usual"].astype(np.float64)
     for index in (3, 11, 29):
         standardised = (ready_encodings()[index] - mean) / std
         u = standardised / np.linalg.norm(standardised)
         dissimilarities = np.square(u - model["prototypes"]).sum(axis=1)
-        by_encoding = localized(client, {"encoding": ready_encodings()[index].tolist()})
-        on_board = localized(client, {"dissimilarities": dissimilarities.tolist()})
+        by_encoding = localize(client, {"encoding": ready_encodings()[index].tolist()})
+        on_board = localize(client, {"dissimilarities": dissimilarities.tolist()})
         assert by_encoding["retrieval"][0]["map_image"] == index
         for board_entry, encoding_entry in zip(on_board["retrieval"], by_encoding["retrieval"], strict=True):
             assert board_entry == {**encoding_entry, "relevance": pytest.approx(encoding_entry["relevance"], abs=1e-5)}
         assert on_board["belief"]["entropy_bits"] == pytest.approx(by_encoding["belief"]["entropy_bits"], abs=1e-4)
-        ranked = np.argsort(dissimilarities, kind="stable").tolist()
-        by_ranks = localized(client, {"ranked_landmarks": ranked})["retrieval"]
+        ranking = np.argsort(dissimilarities, kind="stable").tolist()
+        by_ranks = localize(client, {"ranked_landmarks": ranking})["retrieval"]
         assert index in [entry["map_image"] for entry in by_ranks[:3]]
 
 
 def test_a_view_that_shows_nothing_is_said_so(client):
-    answer = localized(client, {"dissimilarities": [1.0] * N_LANDMARKS})
+    answer = localize(client, {"dissimilarities": [1.0] * N_LANDMARKS})
     assert answer["informative"] is False
     assert answer["warnings"] == ["the view told nothing of the place"]
     assert answer["belief"]["entropy_bits"] == pytest.approx(math.log2(N_READY), abs=0.01)
@@ -159,17 +159,17 @@ def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer_where_ran
     np.fill_diagonal(squared_distances, np.inf)
     landmarks = encodings[np.argsort(-squared_distances.min(axis=1), kind="stable")[:N_LANDMARKS]]
     dissimilarities = np.square(landmarks - encodings[11]).sum(axis=1)
-    ranked = np.argsort(dissimilarities, kind="stable")
+    ranking = np.argsort(dissimilarities, kind="stable")
     answers = [
-        localized(client, body, of=domain)["retrieval"]
+        localize(client, body, of=domain)["retrieval"]
         for body in (
             {"encoding": encodings[11].tolist()},
             {"dissimilarities": dissimilarities.tolist()},
-            {"ranked_landmarks": ranked.tolist()},
+            {"ranked_landmarks": ranking.tolist()},
         )
     ]
     assert answers[0] == answers[1] == answers[2]
-    assert len(localized(client, {"ranked_landmarks": ranked[:1].tolist()}, of=domain)["retrieval"]) == 10
+    assert len(localize(client, {"ranked_landmarks": ranking[:1].tolist()}, of=domain)["retrieval"]) == 10
 
 
 def test_all_relevances_as_npy(client):
@@ -177,7 +177,7 @@ def test_all_relevances_as_npy(client):
     assert answer.status_code == 200
     relevance = np.load(io.BytesIO(answer.content), allow_pickle=False)
     assert (relevance.dtype, relevance.shape) == (np.float32, (N_READY,))
-    best = localized(client)["retrieval"]
+    best = localize(client)["retrieval"]
     order = np.argsort(-relevance, kind="stable")[:10]
     assert [place["map_image"] for place in best] == order.tolist()
     assert [place["relevance"] for place in best] == pytest.approx(relevance[order].tolist())

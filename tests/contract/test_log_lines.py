@@ -1,4 +1,4 @@
-"""What the log tells of a request: whose, what it was about, what was wrong; and that refusals are counted."""
+"""The log line of a request names its key, its subject and its error; refusals are counted."""
 
 import logging
 import re
@@ -67,8 +67,8 @@ def test_jobs_and_maps_that_serve_are_told(tmp_path, lines):
     assert [line["message"] for line in jobs] == ["job started", "job ended"] * 2
     expected = {"domain": "ready", "kind": "remap", "state": "succeeded", "map_version": 2, "active": True}
     assert {name: jobs[-1][name] for name in expected} == expected
-    switched = [vars(record) for record in lines.records if record.message.startswith("map ")]
-    assert [(line["message"], line["domain"], line["map_version"], line["before"]) for line in switched] == [
+    switches = [vars(record) for record in lines.records if record.message.startswith("map ")]
+    assert [(line["message"], line["domain"], line["map_version"], line["before"]) for line in switches] == [
         ("map activated", "ready", 1, None),
         ("map activated", "ready", 2, 1),
         ("map rolled back", "ready", 1, 2),

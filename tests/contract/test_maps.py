@@ -54,9 +54,9 @@ def test_more_landmarks_than_frames_are_refused_at_once_and_none_asked_for_are_a
     client.upload("fitting", "drive", ready_encodings(), np.arange(N_READY))
     client.upload("fitting", "short", noise(3, 12), np.arange(12))
     config = {"training_traverse": "drive", "n_landmarks": N_READY + 1}
-    refused = problem(client.post(remaps, json=config), 422, "too_few_candidates")
-    assert f"{N_READY} is the most that fit" in refused["detail"]
-    assert refused["n_candidates"] == N_READY
+    document = problem(client.post(remaps, json=config), 422, "too_few_candidates")
+    assert f"{N_READY} is the most that fit" in document["detail"]
+    assert document["n_candidates"] == N_READY
     config = {"training_traverse": "drive", "landmark_traverse": "short", "n_landmarks": 13}
     assert problem(client.post(remaps, json=config), 422, "too_few_candidates")["n_candidates"] == 12
     assert client.get("/v1/admin/jobs", params={"domain": "fitting"}).json()["jobs"] == []
@@ -73,7 +73,7 @@ def test_versions_are_switched_and_rolled_back(client, domain):
         document = client.post(f"/v1/domains/{domain}/localizations", json={"ranked_landmarks": [1, 2, 3]}).json()
         return document["map_version"], document["retrieval"]
 
-    old = answer()
+    old_answer = answer()
     assert states(client, domain) == {2: "sealed", 1: "active"}
     response = client.put(active, json={"version": 2, "expected": 1})
     assert (response.status_code, response.json()["state"]) == (200, "active")
@@ -82,7 +82,7 @@ def test_versions_are_switched_and_rolled_back(client, domain):
     problem(client.put(active, json={"version": 1, "expected": 1}), 409, "lost_activation")
     assert answer()[0] == 2
     assert client.put(active, json={"version": 1, "expected": 2}).status_code == 200
-    assert answer() == old
+    assert answer() == old_answer
     assert client.put(active, json={"version": 2}).status_code == 200
 
 
@@ -398,8 +398,8 @@ def test_a_camera_that_cannot_serve_is_named(client, yard):
     for conflict in ({"relevance": "rrf"}, {"append": True}):
         problem(client.post(path, json={**body, "camera_of": "yard", **conflict}), 422, "invalid_map_config")
     for other, says in (("lane", "names domain lane itself"), ("seen", "another evaluator")):
-        refused = problem(client.post(path, json={**body, "camera_of": other}), 422, "invalid_map_config")
-        assert says in refused["detail"]
+        document = problem(client.post(path, json={**body, "camera_of": other}), 422, "invalid_map_config")
+        assert says in document["detail"]
     assert failure_of("yard", camera_of="lane")[0] == "no_active_map"
     assert client.remap("lane", **yard)["state"] == "succeeded"
     assert "knows no second season" in failure_of("yard", camera_of="lane")[1]

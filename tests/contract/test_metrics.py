@@ -21,7 +21,7 @@ def own_client(tmp_path):
         yield client
 
 
-def scraped(client):
+def scrape(client):
     answer = client.get("/metrics")
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"].startswith("text/plain")
@@ -30,21 +30,21 @@ def scraped(client):
 
 def test_metrics_count_by_route_and_not_by_path_each_application_for_itself(client, tmp_path):
     series = 'deepsimbad_requests_total{method="POST",route="/v1/domains/{domain}/localizations",status="200"}'
-    n_before = scraped(client).get(series, 0)
+    n_before = scrape(client).get(series, 0)
     client.post("/v1/domains/ready/localizations", json=RANKS)
     client.get("/v1/domains/some-unknown-name")
     client.get("/some/unknown/path")
-    values = scraped(client)
+    values = scrape(client)
     assert values[series] == n_before + 1
     assert 'deepsimbad_localization_stage_seconds_count{stage="retrieve"}' in values
     assert 'deepsimbad_belief_entropy_bits_count{domain="ready"}' in values
     assert not [name for name in values if "unknown-name" in name or "/some/unknown" in name]
     with service(tmp_path) as other:
-        assert not [name for name in scraped(other) if name.startswith("deepsimbad_requests_total{")]
+        assert not [name for name in scrape(other) if name.startswith("deepsimbad_requests_total{")]
 
 
 def test_a_map_and_the_last_remap(own_client):
-    values = scraped(own_client)
+    values = scrape(own_client)
     assert values['deepsimbad_active_map_version{domain="ready"}'] == 1
     assert values['deepsimbad_map_images{domain="ready"}'] == N_READY
     bits = own_client.get("/v1/domains/ready").json()["index_bits_per_map_image"]
@@ -59,10 +59,10 @@ def test_a_map_and_the_last_remap(own_client):
     ended_at = values['deepsimbad_last_remap_timestamp_seconds{domain="ready"}']
     own_client.upload("ready", "backwards", ready_encodings()[:2], [1.0, 0.0])
     assert own_client.remap("ready", training_traverse="backwards")["state"] == "failed"
-    values = scraped(own_client)
+    values = scrape(own_client)
     outcomes = {name: value for name, value in values.items() if name.startswith("deepsimbad_last_remap{")}
-    failed = 'deepsimbad_last_remap{domain="ready",outcome="failed"}'
-    assert (len(outcomes), [name for name, value in outcomes.items() if value]) == (4, [failed])
+    failed_series = 'deepsimbad_last_remap{domain="ready",outcome="failed"}'
+    assert (len(outcomes), [name for name, value in outcomes.items() if value]) == (4, [failed_series])
     assert values['deepsimbad_last_remap_timestamp_seconds{domain="ready"}'] > ended_at
     assert values['deepsimbad_job_seconds_count{kind="remap",state="failed"}'] == 1
     assert values['deepsimbad_active_map_version{domain="ready"}'] == 1
@@ -70,7 +70,7 @@ def test_a_map_and_the_last_remap(own_client):
 
 def test_sessions_disk_release_and_process(own_client, tmp_path):
     own_client.begin()
-    values = scraped(own_client)
+    values = scrape(own_client)
     assert values["deepsimbad_sessions"] == 1
     usage = shutil.disk_usage(tmp_path)
     assert values["deepsimbad_data_dir_size_bytes"] == usage.total
@@ -80,7 +80,7 @@ def test_sessions_disk_release_and_process(own_client, tmp_path):
     assert values["process_open_fds"] > 3
     assert not [name for name in values if "_created" in name]
     own_client.services.catalog._db.execute("DROP TABLE job")
-    values = scraped(own_client)
+    values = scrape(own_client)
     assert "deepsimbad_sessions" in values, "what can be read is shown"
     assert "deepsimbad_domains" not in values
 
@@ -95,31 +95,31 @@ def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path):
         maps = client.services.maps
         maps._clock = lambda: 0.0
 
-        def damaged():
-            values = scraped(client)
+        def damage_of():
+            values = scrape(client)
             ready = client.get("/readyz").json()
             assert ready["status"] == "ready"
             version = values['deepsimbad_active_map_version{domain="ready"}']
             return version, values['deepsimbad_map_damaged{domain="ready"}'], ready["damaged_maps"]
 
-        assert damaged() == (2, 1, ["ready"])
-        assert 'deepsimbad_map_images{domain="ready"}' not in scraped(client)
+        assert damage_of() == (2, 1, ["ready"])
+        assert 'deepsimbad_map_images{domain="ready"}' not in scrape(client)
         (tmp_path / "aside").rename(path)
         maps._clock = lambda: 1e9  # damage is remembered for some seconds
-        assert damaged() == (2, 0, [])
+        assert damage_of() == (2, 0, [])
     path.unlink()
     with service(tmp_path) as client:
-        assert damaged() == (2, 1, ["ready"])
+        assert damage_of() == (2, 1, ["ready"])
         assert client.put("/v1/admin/domains/ready/active-map", json={"version": 1}).status_code == 200
-        assert damaged() == (1, 0, [])
+        assert damage_of() == (1, 0, [])
 
 
 def test_a_deleted_domain_takes_its_series_along(client, domain):
     client.post(f"/v1/domains/{domain}/localizations", json=RANKS)
-    assert any(f'domain="{domain}"' in name for name in scraped(client))
+    assert any(f'domain="{domain}"' in name for name in scrape(client))
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
     client.services.metrics.localized(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
-    assert not [name for name in scraped(client) if f'domain="{domain}"' in name]
+    assert not [name for name in scrape(client) if f'domain="{domain}"' in name]
 
 
 # Stages
@@ -129,14 +129,14 @@ def test_a_deleted_domain_takes_its_series_along(client, domain):
 def test_every_stage_is_told_and_counted(client, call):
     path = "/v1/domains/seen" if call == "localizations" else client.session("seen")
     names = {stage: f'deepsimbad_localization_stage_seconds_count{{stage="{stage}"}}' for stage in STAGES[call]}
-    old_values = scraped(client)
+    old_values = scrape(client)
     timings_ms = client.post(f"{path}/{call}", content=encoded(picture(1)), headers=JPEG).json()["timings_ms"]
     assert set(timings_ms) == STAGES[call]
     assert min(timings_ms.values()) >= 0
     total = timings_ms.pop("total")
     assert 0 < sum(timings_ms.values()) <= total + 0.001 * len(names)  # each is rounded
     assert min(timings_ms["decode"], timings_ms["describe"]) > 0
-    new_values = scraped(client)
+    new_values = scrape(client)
     counts = {name: value for name, value in new_values.items() if "stage_seconds_count" in name}
     assert {name for name, value in counts.items() if value == old_values.get(name, 0) + 1} == set(names.values())
 
@@ -144,5 +144,5 @@ def test_every_stage_is_told_and_counted(client, call):
 def test_every_stage_is_explained_to_operators_and_no_other():
     section = PAGE.read_text(encoding="utf-8").split("### DeepSimbadSlow")[1].split("### ")[0]
     rows = re.findall(r"^\| (`[^|]*) \|", section, re.MULTILINE)
-    explained = {stage for row in rows for stage in re.findall(r"`(\w+)`", row)}
-    assert explained == set.union(*STAGES.values()) - {"total"}
+    stages = {stage for row in rows for stage in re.findall(r"`(\w+)`", row)}
+    assert stages == set.union(*STAGES.values()) - {"total"}

@@ -46,11 +46,11 @@ def rebuilt(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rebuilt")
     with service(folder) as client:
         client.make_ready_domain("ready")
-        first = client.get(MODEL)
+        first_model = client.get(MODEL)
         client.remap("ready", landmark_traverse="drive", n_landmarks=7)
     with service(folder) as client:
-        again = client.get(MODEL, params={"map_version": 1})
-        assert (again.content, again.headers["etag"]) == (first.content, first.headers["etag"])
+        model = client.get(MODEL, params={"map_version": 1})
+        assert (model.content, model.headers["etag"]) == (first_model.content, first_model.headers["etag"])
         yield client
 
 
@@ -86,16 +86,16 @@ def test_its_tag_is_the_digest_that_the_domain_tells(client):
 
 
 def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt):
-    latest, first = (rebuilt.get(MODEL, params=params) for params in ({}, {"map_version": 1}))
-    new, old = OnBoardEncoder(latest.content), OnBoardEncoder(first.content)
-    assert (new.map_version, new.n_landmarks, old.map_version) == (2, 7, 1)
-    assert latest.headers["etag"] != first.headers["etag"]
+    new_model, old_model = (rebuilt.get(MODEL, params=params) for params in ({}, {"map_version": 1}))
+    new_encoder, old_encoder = OnBoardEncoder(new_model.content), OnBoardEncoder(old_model.content)
+    assert (new_encoder.map_version, new_encoder.n_landmarks, old_encoder.map_version) == (2, 7, 1)
+    assert new_model.headers["etag"] != old_model.headers["etag"]
     rebuilt.put("/v1/admin/domains/ready/active-map", json={"version": 1})
     path = rebuilt.session()
     rebuilt.put("/v1/admin/domains/ready/active-map", json={"version": 2})
-    ranked = old.ranks(encoding=np.arange(8), m=5)
-    assert rebuilt.post(f"{path}/observations", content=ranked.body, headers=ranked.headers).status_code == 200
-    answer = rebuilt.post(READY, content=ranked.body, headers=ranked.headers)
+    ranks = old_encoder.ranks(encoding=np.arange(8), m=5)
+    assert rebuilt.post(f"{path}/observations", content=ranks.body, headers=ranks.headers).status_code == 200
+    answer = rebuilt.post(READY, content=ranks.body, headers=ranks.headers)
     assert problem(answer, 409, "landmark_model_differs")["map_version"] == 2
 
 
@@ -177,12 +177,12 @@ def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_p
     with robot.session("ranked") as board_session, robot.session("ranked") as image_session:
         for number in (5, 3):
             path.write_bytes(encoded(picture(number)))
-            ranked = encoder.ranks(path)
-            assert len(ranked.body) <= 64
-            on_board, by_image = robot.localize("ranked", on_board=ranked), robot.localize("ranked", path)
+            ranks = encoder.ranks(path)
+            assert len(ranks.body) <= 64
+            on_board, by_image = robot.localize("ranked", on_board=ranks), robot.localize("ranked", path)
             assert (on_board.retrieval, on_board.belief) == (by_image.retrieval, by_image.belief)
-            assert board_session.observe(on_board=ranked).belief == image_session.observe(path).belief
-        assert (robot.relevances("ranked", on_board=ranked) == robot.relevances("ranked", path)).all()
+            assert board_session.observe(on_board=ranks).belief == image_session.observe(path).belief
+        assert (robot.relevances("ranked", on_board=ranks) == robot.relevances("ranked", path)).all()
         dark = encoded(np.zeros((90, 120, 3), np.uint8))
         assert board_session.observe(on_board=encoder.ranks(dark)).belief == image_session.observe(dark).belief
 
@@ -212,9 +212,9 @@ def test_a_map_that_compares_ranks_takes_no_unit_encoding(client):
 
 def test_the_client_names_other_landmarks(client):
     robot = Client(str(client.base_url), transport=client._transport)
-    ranked = robot.on_board("ready").ranks(encoding=np.arange(8))
-    assert robot.localize("ready", on_board=ranked).map_version == 1
+    ranks = robot.on_board("ready").ranks(encoding=np.arange(8))
+    assert robot.localize("ready", on_board=ranks).map_version == 1
     with pytest.raises(LandmarkModelDiffersError, match="on_board") as caught:
-        robot.localize("ready", on_board=Observation(ranked.body, ranked.content_type, "other"))
+        robot.localize("ready", on_board=Observation(ranks.body, ranks.content_type, "other"))
     assert caught.value.problem["given_landmark_models"] == ["other"]
-    assert len(robot.relevances("ready", on_board=ranked)) == N_READY
+    assert len(robot.relevances("ready", on_board=ranks)) == N_READY

@@ -33,12 +33,12 @@ def full_queue(busy):
     worker, gate, has_begun = busy.services.worker, threading.Event(), threading.Event()
     worker.submit(lambda: (has_begun.set(), gate.wait(60)))
     assert has_begun.wait(60)
-    waiting = worker.submit(lambda: None)
+    answer = worker.submit(lambda: None)
     try:
         yield
     finally:
         gate.set()
-    waiting.result(60)
+    answer.result(60)
 
 
 def test_a_full_queue(busy):

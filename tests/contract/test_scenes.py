@@ -54,10 +54,10 @@ def test_no_object_tells_nothing_and_unknown_labels_are_taken(client, objects):
     assert answer["informative"] is False
     strange = client.post(objects, json={"objects": [{"label": "zebra crossing", "box": [0, 0, 1, 1]}]})
     assert strange.status_code == 200
-    stored = client.put(
+    response = client.put(
         "/v1/admin/domains/objects/traverses/empty/frames/0?position_m=0", json={"objects": []}
     )  # of no traverse
-    assert problem(stored, 404, "unknown_traverse")
+    assert problem(response, 404, "unknown_traverse")
 
 
 @pytest.mark.parametrize(
@@ -85,12 +85,12 @@ def test_more_objects_than_a_body_may_hold_are_413(client, objects):
 
 
 def test_forms_that_a_domain_does_not_take_are_415(client, objects):
-    refused = problem(client.post(objects, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
-    assert "text/plain" not in refused["allowed"]
+    document = problem(client.post(objects, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
+    assert "text/plain" not in document["allowed"]
     problem(client.post(objects, content=encoded(picture(1)), headers=JPEG), 415, "unsupported_media_type")
     image_url = "/v1/domains/seen/localizations"
-    refused = problem(client.post(image_url, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
-    assert "image/jpeg" in refused["allowed"]
+    document = problem(client.post(image_url, content=b"a tree", headers=TEXT), 415, "unsupported_media_type")
+    assert "image/jpeg" in document["allowed"]
     problem(client.post(image_url, json={"objects": objects_at(0)}), 415, "unsupported_media_type")
     scene = scene_observation({"objects": objects_at(0)}, encoded(picture(1)))
     problem(client.post(image_url, content=scene.body, headers=scene.headers), 415, "unsupported_media_type")
@@ -128,8 +128,8 @@ def test_texts_of_no_use_are_named(client, language):
     problem(client.post(language, json={"text": " "}), 422, "invalid_scene")
     problem(client.post(language, content=b"", headers=TEXT), 422, "empty_body")
     problem(client.post(language, content=b"\xff\xfe", headers=TEXT), 422, "invalid_scene")
-    refused = problem(client.post(language, json={"text": "a tree " * 600}), 422, "invalid_scene")
-    assert refused["most_characters"] == 4000
+    document = problem(client.post(language, json={"text": "a tree " * 600}), 422, "invalid_scene")
+    assert document["most_characters"] == 4000
     long = client.post(language, content=b"a tree. " * 131072, headers=TEXT)
     assert long.status_code in {413, 422}
     foreign = client.post(language, json={"text": "左边有一辆红色的汽车"}).json()

@@ -90,9 +90,9 @@ def test_a_session_from_beginning_to_end(client):
     assert set(state) == STATE
     assert state["belief"] == second_answer["belief"] == client.get(f"{path}/belief").json()
     assert state["next_best_view"] == second_answer["next_best_view"] == client.get(f"{path}/next-best-view").json()
-    packed = client.get(f"{path}/belief", headers={"Accept": "application/octet-stream"})
-    assert packed.headers["content-type"] == "application/octet-stream"
-    mass = np.load(io.BytesIO(packed.content))
+    response = client.get(f"{path}/belief", headers={"Accept": "application/octet-stream"})
+    assert response.headers["content-type"] == "application/octet-stream"
+    mass = np.load(io.BytesIO(response.content))
     assert (mass.dtype, mass.shape) == (np.float32, (N_READY,))
     assert mass.sum() == pytest.approx(1)
     assert int(mass.argmax()) == second_answer["belief"]["top"][0]["map_image"]
@@ -222,12 +222,14 @@ def test_a_robot_that_was_carried_is_lost_and_found(client, belief):
 
 
 def test_metres_may_be_given_a_price(client):
-    free, dear = (see(client, client.session(price_bits_per_m=price), 11)["next_best_view"] for price in (0, 100))
-    assert see(client, client.session(), 11)["next_best_view"] == free
-    assert (free["action_m"] > 5, dear["action_m"]) == (True, 1)
-    bits = [[action["expected_bits"] for action in plan["actions"]] for plan in (free, dear)]
+    free_plan, dear_plan = (
+        see(client, client.session(price_bits_per_m=price), 11)["next_best_view"] for price in (0, 100)
+    )
+    assert see(client, client.session(), 11)["next_best_view"] == free_plan
+    assert (free_plan["action_m"] > 5, dear_plan["action_m"]) == (True, 1)
+    bits = [[action["expected_bits"] for action in plan["actions"]] for plan in (free_plan, dear_plan)]
     assert bits[0] == bits[1]
-    values = [action["q_value"] for action in dear["actions"]]
+    values = [action["q_value"] for action in dear_plan["actions"]]
     assert values == sorted(values, reverse=True)
     constant = client.begin(planner="constant:3", price_bits_per_m=1.5)["next_best_view"]
     assert {(action["q_value"], action["expected_bits"]) for action in constant["actions"]} == {(None, None)}
@@ -408,16 +410,16 @@ def test_a_robot_that_goes_backward_is_followed(client, back_and_forth, belief):
         position = see(client, path, image, action_m)["belief"]
         assert (position["mode_m"], position["off_route"] < 0.1) == (2 * image, True), action_m
     for action_m in ("-100.5", "100.5", "nan"):
-        refused = problem(observe(client, path, action_m), 422, "invalid_move")
-        assert (refused["minimum"], refused["maximum"]) == (-100, 100)
+        document = problem(observe(client, path, action_m), 422, "invalid_move")
+        assert (document["minimum"], document["maximum"]) == (-100, 100)
     path = client.session(name, start_position_m=10, start_std_m=0.5, belief=belief)
     see(client, path, 5)
     far_move = observe(client, path, -50)
     if closed:
         assert far_move.status_code == 200, far_move.text
     else:
-        refused = problem(far_move, 422, "past_the_end")
-        assert (refused["route_end_m"], "the route begins at 0 m" in refused["detail"]) == (0, True)
+        document = problem(far_move, 422, "past_the_end")
+        assert (document["route_end_m"], "the route begins at 0 m" in document["detail"]) == (0, True)
 
 
 @pytest.mark.parametrize("planner", ["informed", "nnql", "random", "constant:-6", "constant:0"])
@@ -432,11 +434,13 @@ def test_every_planner_chooses_among_all_moves_and_staying_is_no_stop(client, ba
     if planner.startswith("constant"):
         assert plan["action_m"] == float(planner.partition(":")[2])
     if planner == "informed":
-        tells = {action["action_m"]: action["expected_bits"] for action in plan["actions"]}
-        assert tells[0] == 0 < min(tells[-6], tells[2], tells[10])
-        dear = client.session(name, planner=planner, confidence=0.999999, price_bits_per_m=100)
-        stays = see(client, dear, 20)["next_best_view"]
-        assert (stays["action_m"], stays["stop"]) == (0, False), "moving is too dear, and the place is not known"
-    sure = client.session(name, planner=planner, confidence=0.5, start_position_m=40, start_std_m=0.1)
-    assert see(client, sure, 20)["next_best_view"]["stop"] is True, "whatever the next move would be"
+        bits = {action["action_m"]: action["expected_bits"] for action in plan["actions"]}
+        assert bits[0] == 0 < min(bits[-6], bits[2], bits[10])
+        dear_path = client.session(name, planner=planner, confidence=0.999999, price_bits_per_m=100)
+        dear_plan = see(client, dear_path, 20)["next_best_view"]
+        assert (dear_plan["action_m"], dear_plan["stop"]) == (0, False), (
+            "moving is too dear, and the place is not known"
+        )
+    sure_path = client.session(name, planner=planner, confidence=0.5, start_position_m=40, start_std_m=0.1)
+    assert see(client, sure_path, 20)["next_best_view"]["stop"] is True, "whatever the next move would be"
     problem(client.post(f"/v1/domains/{name}/sessions", json={"planner": "constant:-2"}), 422, "invalid_input")

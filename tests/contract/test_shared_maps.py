@@ -50,7 +50,7 @@ def wait_for_version(client, version):
 
 
 def answer_once_known(client, domain):
-    """What a domain's localization is answered; of a fleet each process hears of a domain by itself."""
+    """The answer to a localization once the domain is known: in a fleet each process hears of a domain by itself."""
     answers = []
 
     def is_known():
@@ -94,9 +94,9 @@ def test_a_service_without_its_store_serves_what_it_has_and_says_what_it_has_not
     assert answer_of(client_b) == answer
     session = client_b.session()
     assert answer_of(client_b, f"{session}/observations")["map_version"] == 1
-    cold = client_b.post("/v1/domains/cold/localizations", json=RANKS)
-    problem(cold, 503, "unavailable")
-    assert cold.headers["retry-after"]
+    response = client_b.post("/v1/domains/cold/localizations", json=RANKS)
+    problem(response, 503, "unavailable")
+    assert response.headers["retry-after"]
     problem(activate(client_a, 1, 1), 503, "unavailable")
     problem(client_a.delete("/v1/admin/domains/ready"), 503, "unavailable")
     job = client_a.remap("ready")

@@ -92,13 +92,16 @@ def test_views_and_frames_of_other_weights_are_refused_with_both_digests(tmp_pat
         assert client.post(VIEW, json=RANKS).status_code == 200  # the map itself is as good as before
         assert set(client.upload_pictures("street", "drive")) == {409}
         assert set(client.upload_pictures("street", "again")) == {201}
-        again = {"training_traverse": "again"}
-        for config in (again, {**DRIVES, **again}):  # the landmarks are the old ones: the active map's, the drive's
+        new_drive = {"training_traverse": "again"}
+        for config in (
+            new_drive,
+            {**DRIVES, **new_drive},
+        ):  # the landmarks are the old ones: the active map's, the drive's
             job = client.remap("street", **config)
             assert (job["state"], job["error"]["code"]) == ("failed", "weights_differ")
         assert first[:12] in str(job["error"])
         assert second[:12] in str(job["error"])
-        job = client.remap("street", **DRIVES | again | {"landmark_traverse": "again"})
+        job = client.remap("street", **DRIVES | new_drive | {"landmark_traverse": "again"})
         assert job["state"] == "succeeded", job
         check = job["result"]["metrics"]["check"]
         assert check["anr_active"] is None
@@ -148,10 +151,10 @@ def test_a_domain_is_not_made_of_weights_that_cannot_be_loaded(tmp_path):
 
 def test_what_is_left_out_is_as_the_domain_has_it(client):
     """The default may have been another one when the domain was made."""
-    old = {"kind": "feature_l2", "extractor": "gradient_grid"}
-    assert client.put("/v1/admin/domains/old", json={"evaluator": old}).status_code == 201
-    again = client.put("/v1/admin/domains/old", json={"evaluator": {"kind": "feature_l2"}})
-    assert (again.status_code, again.json()["evaluator"]) == (200, old)
+    old_config = {"kind": "feature_l2", "extractor": "gradient_grid"}
+    assert client.put("/v1/admin/domains/old", json={"evaluator": old_config}).status_code == 201
+    answer = client.put("/v1/admin/domains/old", json={"evaluator": {"kind": "feature_l2"}})
+    assert (answer.status_code, answer.json()["evaluator"]) == (200, old_config)
     problem(client.put("/v1/admin/domains/old", json=TAKES_ENCODINGS), 409, "domain_differs")
 
 

@@ -126,8 +126,8 @@ def test_domains_that_cannot_be(routes, domains):
 
 def test_who_cannot_be_asked_is_named(routes):
     view = view_of(routes, "a", 0)
-    unknown = problem(routes.post(URL, json={**view, "domains": ["a", "nowhere"]}), 404, "unknown_domain")
-    assert "nowhere" in unknown["detail"]
+    document = problem(routes.post(URL, json={**view, "domains": ["a", "nowhere"]}), 404, "unknown_domain")
+    assert "nowhere" in document["detail"]
     problem(routes.post(URL, json={**view, "domains": ["unmapped"]}), 409, "no_active_map")
     problem(routes.post(URL, json={**view, "domains": ["long"]}), 422, "invalid_encoding")
     nobody = problem(routes.post(URL, json={**view, "domains": ["long", "unmapped"]}), 409, "no_domain_answers")
@@ -210,8 +210,8 @@ def test_a_key_asks_its_own_domains_alone(tmp_path):
         client.headers["X-API-Key"] = key.text
         view = {"encoding": ready_encodings()[3].tolist()}
         assert [domain["domain"] for domain in answer_of(client, view)["domains"]] == ["mine"]
-        refused = problem(client.post(URL, json={**view, "domains": ["mine", "other"]}), 403, "forbidden")
-        assert refused["domains"] == ["mine", "later"]
+        document = problem(client.post(URL, json={**view, "domains": ["mine", "other"]}), 403, "forbidden")
+        assert document["domains"] == ["mine", "later"]
 
 
 def test_maps_give_way_and_warming_brings_them_back(tmp_path):
@@ -224,9 +224,9 @@ def test_maps_give_way_and_warming_brings_them_back(tmp_path):
         assert client.services.maps.n_loaded == 1
         full_answer = answer_of(client, view)
         assert [entry["code"] for entry in full_answer["left_out"]] == ["not_loaded"]
-        (cold,) = (entry["domain"] for entry in full_answer["left_out"])
-        assert client.post(f"/v1/admin/domains/{cold}/warm").status_code == 202
-        assert client.services.maps.peek(cold) is not None
+        (cold_name,) = (entry["domain"] for entry in full_answer["left_out"])
+        assert client.post(f"/v1/admin/domains/{cold_name}/warm").status_code == 202
+        assert client.services.maps.peek(cold_name) is not None
         problem(client.post("/v1/admin/domains/nowhere/warm"), 404, "unknown_domain")
         client.put("/v1/admin/domains/unmapped", json=TAKES_ENCODINGS)
         problem(client.post("/v1/admin/domains/unmapped/warm"), 409, "no_active_map")

@@ -103,11 +103,11 @@ def test_a_job_whose_own_process_dies_fails_by_name_and_one_that_is_cancelled_en
     with Client(server.url) as client:
         job, pid = training(server, client)
         os.kill(pid, signal.SIGKILL)
-        failed = ended_job(client, job.job_id)
-        assert failed.state == "failed"
-        assert failed.error is not None
-        assert failed.error["code"] == "job_interrupted"
-        assert "SIGKILL" in str(failed.error)
+        failed_job = ended_job(client, job.job_id)
+        assert failed_job.state == "failed"
+        assert failed_job.error is not None
+        assert failed_job.error["code"] == "job_interrupted"
+        assert "SIGKILL" in str(failed_job.error)
         assert client.admin.maps("campus") == ()
         next_job = client.admin.remap("campus", **CONFIG, training_episodes=SHORT)
         assert ended_job(client, next_job.job_id).state == "succeeded"

@@ -145,13 +145,13 @@ def test_what_was_acknowledged_is_there_afterwards(service: Service) -> None:
     robots = [Robot(service, number) for number in range(8)]
     for robot in robots:
         robot.begin()
-    for by, code in ENDS.items():
+    for signal_number, code in ENDS.items():
         threads = [threading.Thread(target=robot.until_refused) for robot in robots]
         n_before = sum(robot.n_told for robot in robots)
         for thread in threads:
             thread.start()
         wait_until(lambda n_least=n_before + 100: sum(robot.n_told for robot in robots) >= n_least)
-        service.signal(by)
+        service.signal(signal_number)
         assert service.wait(60) == code
         for thread in threads:
             thread.join(60)
@@ -188,17 +188,21 @@ def is_stopping(service: Service) -> bool:
 
 def test_what_is_under_way_is_finished_and_what_is_idle_is_closed(service: Service) -> None:
     service.start()
-    with service.connect() as idle, service.connect() as fresh, send_frame(service, 5) as under_way:
-        idle.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    with (
+        service.connect() as idle_connection,
+        service.connect() as new_connection,
+        send_frame(service, 5) as busy_connection,
+    ):
+        idle_connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
         answer = b""
         while not answer.endswith(b'{"status":"alive"}'):
-            answer += idle.recv(65536)
+            answer += idle_connection.recv(65536)
         service.signal(signal.SIGTERM)
-        assert idle.recv(65536) == b""
-        assert fresh.recv(65536) == b""
+        assert idle_connection.recv(65536) == b""
+        assert new_connection.recv(65536) == b""
         wait_until(lambda: is_stopping(service))
-        under_way.sendall(json.dumps({"encoding": [1.0] * 8}).encode()[5:])
-        answer = read_all(under_way)
+        busy_connection.sendall(json.dumps({"encoding": [1.0] * 8}).encode()[5:])
+        answer = read_all(busy_connection)
         assert answer.startswith(b"HTTP/1.1 200 ")
     assert service.wait(60) == 0
 
@@ -206,10 +210,10 @@ def test_what_is_under_way_is_finished_and_what_is_idle_is_closed(service: Servi
 def test_who_takes_too_long_is_told_so(service: Service) -> None:
     service.environment = {"DEEPSIMBAD_SHUTDOWN_GRACE_S": "1"}
     service.start()
-    with send_frame(service, 5) as under_way:
+    with send_frame(service, 5) as busy_connection:
         time.sleep(0.1)
         service.signal(signal.SIGTERM)
-        head, _, content = read_all(under_way).partition(b"\r\n\r\n")
+        head, _, content = read_all(busy_connection).partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 503 ")
         assert json.loads(content)["code"] == "unavailable"
     assert service.wait(60) == 0
@@ -237,12 +241,12 @@ def test_a_second_signal_does_not_wait(service: Service) -> None:
     service.start()
     robot = Robot(service, 1)
     robot.begin()
-    for by, code in ENDS.items():
+    for signal_number, code in ENDS.items():
         with send_frame(service, 5):
             time.sleep(0.1)
-            service.signal(by)
+            service.signal(signal_number)
             wait_until(lambda: is_stopping(service))
-            service.signal(by)
+            service.signal(signal_number)
             assert service.wait(60) == code
         service.start()
         assert service.ask("GET", f"/v1/sessions/{robot.session_id}")["n_observations"] == 0

@@ -90,13 +90,13 @@ def catalog(tmp_path: Path) -> Iterator[Catalog]:
 
 @pytest.fixture
 def mapped_catalog(catalog: Catalog) -> Catalog:
-    """One domain, d, with its first map."""
+    """A catalog with one domain, `d`, that has its first map."""
     add_domain(catalog, "d")
     add_map(catalog)
     return catalog
 
 
-class Live:
+class Service:
     """One run of a service over a data directory."""
 
     def __init__(self, catalog: Catalog, clock: Clock, **options: Any) -> None:
@@ -114,36 +114,36 @@ class Live:
 
 
 @contextmanager
-def running(catalog: Catalog, clock: Clock | None = None, **options: Any) -> Iterator[Live]:
-    live = Live(catalog, clock or Clock(), **options)
+def open_service(catalog: Catalog, clock: Clock | None = None, **options: Any) -> Iterator[Service]:
+    service = Service(catalog, clock or Clock(), **options)
     try:
-        yield live
+        yield service
     finally:
-        live.sessions.close()
-        live.worker.close()
-        live.store.close()
+        service.sessions.close()
+        service.worker.close()
+        service.store.close()
 
 
 def run(
-    catalog: Catalog, body: Callable[[Live], Coroutine[Any, Any, T]], clock: Clock | None = None, **options: Any
+    catalog: Catalog, body: Callable[[Service], Coroutine[Any, Any, T]], clock: Clock | None = None, **options: Any
 ) -> T:
     """Run a coroutine against a service that is started for it, and stopped after it."""
-    with running(catalog, clock, **options) as live:
-        return asyncio.run(body(live))
+    with open_service(catalog, clock, **options) as service:
+        return asyncio.run(body(service))
 
 
-def viewed(view: View) -> Callable[[Evaluator, Map], Awaitable[tuple[View, Sequence[str]]]]:
-    async def give(_evaluator: Evaluator, _map: Map) -> tuple[View, Sequence[str]]:
+def view_decoder(view: View) -> Callable[[Evaluator, Map], Awaitable[tuple[View, Sequence[str]]]]:
+    async def decode(_evaluator: Evaluator, _map: Map) -> tuple[View, Sequence[str]]:
         return view, ()
 
-    return give
+    return decode
 
 
-def ranked(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d") -> Observation:
+def ranked_observation(seed: int, action_m: float = 1.5, key: str | None = None, digest: bytes = b"d") -> Observation:
     ids = np.random.default_rng(seed).permutation(N_LANDMARKS)[: 1 + seed % N_LANDMARKS]
     idempotency = None if key is None else IdempotencyKey(key, digest)
-    return Observation(viewed(RankedLandmarks(tuple(ids.tolist()))), action_m, idempotency=idempotency)
+    return Observation(view_decoder(RankedLandmarks(tuple(ids.tolist()))), action_m, idempotency=idempotency)
 
 
-def encoded(seed: int, action_m: float = 1.5) -> Observation:
-    return Observation(viewed(ReadyEncoding(np.random.default_rng(seed).normal(size=DIM))), action_m)
+def encoding_observation(seed: int, action_m: float = 1.5) -> Observation:
+    return Observation(view_decoder(ReadyEncoding(np.random.default_rng(seed).normal(size=DIM))), action_m)

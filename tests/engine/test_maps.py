@@ -20,7 +20,7 @@ from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.layout import catalog_path
 from deepsimbad.store.records import KeptMap, MapState
 
-from .conftest import N_IMAGES, Clock, Live, add_domain, add_map, map_contents, running
+from .conftest import N_IMAGES, Clock, Service, add_domain, add_map, map_contents, open_service
 
 
 @pytest.fixture
@@ -110,8 +110,8 @@ def test_domain_and_version_are_the_catalogs_and_not_the_files(catalog: Catalog,
 # Which are kept
 
 
-def retention_of(live: Live, keep_maps: int = 1) -> Retention:
-    return Retention(live.catalog, live.store, live.maps, keep_maps)
+def retention_of(service: Service, keep_maps: int = 1) -> Retention:
+    return Retention(service.catalog, service.store, service.maps, keep_maps)
 
 
 def with_files(catalog: Catalog) -> list[int]:
@@ -169,30 +169,30 @@ def test_one_domain_alone_can_be_pruned(mapped_catalog: Catalog) -> None:
     add_domain(mapped_catalog, "e")
     for domain in ("d", "e", "d", "e", "d", "e"):
         add_map(mapped_catalog, domain)
-    with running(mapped_catalog) as live:
-        assert retention_of(live).prune("e") == 1
+    with open_service(mapped_catalog) as service:
+        assert retention_of(service).prune("e") == 1
         assert len(with_files(mapped_catalog)) == 4
-        assert retention_of(live).prune() == 2
+        assert retention_of(service).prune() == 2
 
 
 def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped_catalog: Catalog) -> None:
     """A session begins on the map that the service last saw serve, though another process has activated another."""
-    with running(mapped_catalog) as live:
-        mapped_domain = live.maps.active("d")
+    with open_service(mapped_catalog) as service:
+        mapped_domain = service.maps.active("d")
         add_map(mapped_catalog)
-        with live.maps.beginning(mapped_domain.snapshot), pytest.raises(MapInUseError):
-            retention_of(live).remove("d", 1)
-        retention_of(live).remove("d", 1)
+        with service.maps.beginning(mapped_domain.snapshot), pytest.raises(MapInUseError):
+            retention_of(service).remove("d", 1)
+        retention_of(service).remove("d", 1)
         with pytest.raises(UnavailableError, match="try again"):
-            asyncio.run(live.sessions.begin(mapped_domain, SessionConfig()))
-        assert live.store.pins() == set()
-        assert asyncio.run(live.sessions.begin(live.maps.refresh("d"), SessionConfig())).snapshot.version == 2
+            asyncio.run(service.sessions.begin(mapped_domain, SessionConfig()))
+        assert service.store.pins() == set()
+        assert asyncio.run(service.sessions.begin(service.maps.refresh("d"), SessionConfig())).snapshot.version == 2
 
 
 def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Catalog) -> None:
     """Whatever the order of things, the map of every session that was acknowledged is there."""
-    with running(mapped_catalog, max_sessions=1000) as live:
-        retention, is_over = retention_of(live), threading.Event()
+    with open_service(mapped_catalog, max_sessions=1000) as service:
+        retention, is_over = retention_of(service), threading.Event()
 
         def switching() -> None:
             try:
@@ -208,12 +208,12 @@ def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Cata
         async def beginning() -> int:
             n_begun = 0
             while not is_over.is_set():
-                mapped_domain = live.maps.active("d")
+                mapped_domain = service.maps.active("d")
                 try:
-                    await live.sessions.begin(mapped_domain, SessionConfig())
+                    await service.sessions.begin(mapped_domain, SessionConfig())
                     n_begun += 1
                 except UnavailableError:
-                    live.maps.refresh("d")
+                    service.maps.refresh("d")
             return n_begun
 
         thread = threading.Thread(target=switching)
@@ -221,7 +221,7 @@ def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Cata
         n_begun = asyncio.run(beginning())
         thread.join()
         assert n_begun > 0
-        assert {version for _, version in live.store.pins()} <= set(with_files(mapped_catalog))
+        assert {version for _, version in service.store.pins()} <= set(with_files(mapped_catalog))
 
 
 def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
@@ -232,11 +232,11 @@ def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
     def dies(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with running(mapped_catalog) as live:
+    with open_service(mapped_catalog) as service:
         with monkeypatch.context() as patched:
             patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
             with pytest.raises(KeyboardInterrupt):
-                retention_of(live).remove("d", 1)
+                retention_of(service).remove("d", 1)
         assert mapped_catalog.map("d", 1).removed_at is not None
         assert mapped_catalog.map_path("d", 1).is_file()
         with pytest.raises(RetiredMapError):
@@ -250,9 +250,9 @@ def test_where_sessions_cannot_be_read_nothing_is_removed_and_nobody_stopped(
 ) -> None:
     for _ in range(2):
         add_map(mapped_catalog)
-    with running(mapped_catalog) as live:
-        live.store.close()
-        assert retention_of(live).prune() == 0
+    with open_service(mapped_catalog) as service:
+        service.store.close()
+        assert retention_of(service).prune() == 0
         assert "old maps could not be looked for" in caplog.text
     assert with_files(mapped_catalog) == [1, 2, 3]
 

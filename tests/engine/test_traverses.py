@@ -37,8 +37,8 @@ def test_one_file_serves_all_who_ask_and_idle_ones_are_closed_beyond_a_number(le
                 assert (traverse is oldest) == (n == 0)
         oldest.put_frames(frame(0))  # in use, so still open
     assert len(lending._open) <= MAX_IDLE + 1
-    with lending.lend("d", "t0") as again:
-        assert again is oldest
+    with lending.lend("d", "t0") as traverse_again:
+        assert traverse_again is oldest
     lending.close()
     assert not lending._open
 
@@ -61,12 +61,12 @@ def test_one_deleted_by_another_process_is_not_lent_again(lending: OpenTraverses
     with pytest.raises(UnknownTraverseError), lending.lend("d", "t0"):
         pass
     Traverse.create(tmp_path, "d", "t0").close()
-    with lending.lend("d", "t0") as old:
-        assert old.n_frames == 0
+    with lending.lend("d", "t0") as old_traverse:
+        assert old_traverse.n_frames == 0
         Traverse.delete(tmp_path, "d", "t0")
         Traverse.create(tmp_path, "d", "t0").close()
         with lending.lend("d", "t0") as traverse:
-            assert traverse is not old
+            assert traverse is not old_traverse
             traverse.put_frames(frame(1))
     assert [loan.traverse for loan in lending._open.values()] == [traverse], "the old one is closed"
 

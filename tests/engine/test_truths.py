@@ -16,35 +16,35 @@ from deepsimbad.engine.truths import Truths, true_images
 from deepsimbad.engine.worker import Priority
 from deepsimbad.store.catalog import Catalog
 
-from .conftest import Clock, Live, add_domain, add_map, encoded, map_contents, ranked, run
+from .conftest import Clock, Service, add_domain, add_map, encoding_observation, map_contents, ranked_observation, run
 
 NAN = math.nan
 
 
-def truths_of(live: Live) -> Truths:
-    return Truths(live.store, live.worker, live.sessions, Clock())
+def truths_of(service: Service) -> Truths:
+    return Truths(service.store, service.worker, service.sessions, Clock())
 
 
 async def drive_session(
-    live: Live, observations: Sequence[Observation], priors: Sequence[int] = (), **config: object
+    service: Service, observations: Sequence[Observation], priors: Sequence[int] = (), **config: object
 ) -> tuple[str, list[NDArray[np.float64]]]:
     """A session, and its belief as it was answered after every observation."""
-    session_id = await live.begin(**config)
+    session_id = await service.begin(**config)
     masses = []
     for number, observation in enumerate(observations):
         if number in priors:
-            await live.sessions.set_prior(session_id, 10.0, 3.0)
-        await live.sessions.observe(session_id, observation)
-        masses.append(await live.sessions.mass(session_id))
+            await service.sessions.set_prior(session_id, 10.0, 3.0)
+        await service.sessions.observe(session_id, observation)
+        masses.append(await service.sessions.mass(session_id))
     return session_id, masses
 
 
 def slow_share(mass: NDArray[np.float64], route: Route, position_m: float) -> float:
     """The rank share of a truth by design's rule, one map image after the other."""
-    nearest = min(range(route.n_images), key=lambda image: abs(route.offset_m(route.position_m, position_m)[image]))
-    better = sum(mass[image] > mass[nearest] for image in range(route.n_images))
-    tied = sum(mass[image] == mass[nearest] for image in range(route.n_images) if image != nearest)
-    return float((better + 0.5 * tied) / route.n_images)
+    true_image = min(range(route.n_images), key=lambda image: abs(route.offset_m(route.position_m, position_m)[image]))
+    n_better = sum(mass[image] > mass[true_image] for image in range(route.n_images))
+    n_tied = sum(mass[image] == mass[true_image] for image in range(route.n_images) if image != true_image)
+    return float((n_better + 0.5 * n_tied) / route.n_images)
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -55,15 +55,15 @@ def test_every_truth_is_ranked_in_the_belief_of_its_time(
 ) -> None:
     add_domain(catalog, "d", closed)
     add_map(catalog, contents=map_contents(closed=closed))
-    views = [ranked(seed, 0.5) if seed % 2 else encoded(seed, 0.4) for seed in range(n_views)]
+    views = [ranked_observation(seed, 0.5) if seed % 2 else encoding_observation(seed, 0.4) for seed in range(n_views)]
 
-    async def body(live: Live) -> None:
-        session_id, masses = await drive_session(live, views, priors=[4], belief=belief)
-        route = live.maps.active("d").snapshot.route
+    async def body(service: Service) -> None:
+        session_id, masses = await drive_session(service, views, priors=[4], belief=belief)
+        route = service.maps.active("d").snapshot.route
         positions_m: list[float | None] = [0.41 + 0.6 * number for number in range(n_views)]
         if n_views > 3:
             positions_m[2] = None
-        truths = await truths_of(live).rank(session_id, positions_m)
+        truths = await truths_of(service).rank(session_id, positions_m)
         expected = [
             NAN if position_m is None else slow_share(mass, route, position_m)
             for mass, position_m in zip(masses, positions_m, strict=True)
@@ -81,10 +81,10 @@ def test_a_live_view_goes_before_the_rest_of_a_replay(mapped_catalog: Catalog, m
     """Whoever comes while a session is replayed waits for a piece of it, not for all."""
     monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
 
-    async def body(live: Live) -> None:
-        session_id, _ = await drive_session(live, [ranked(seed, 0.1) for seed in range(9)])
+    async def body(service: Service) -> None:
+        session_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(9)])
         order: list[str] = []
-        submit = live.worker.submit
+        submit = service.worker.submit
 
         def noting(run: Callable[[], object], priority: Priority = Priority.LIVE) -> Future[object]:
             def noted() -> object:
@@ -95,8 +95,8 @@ def test_a_live_view_goes_before_the_rest_of_a_replay(mapped_catalog: Catalog, m
 
             return submit(noted, priority)
 
-        live.worker.submit = noting  # type: ignore[method-assign,assignment]
-        await truths_of(live).rank(session_id, [1.0] * 9)
+        service.worker.submit = noting  # type: ignore[method-assign,assignment]
+        await truths_of(service).rank(session_id, [1.0] * 9)
         assert order == ["BATCH"] * 4 + ["LIVE"] + ["BATCH"] * 6  # the start, then a row a piece
 
     run(mapped_catalog, body)
@@ -109,17 +109,17 @@ def test_a_truth_on_a_closed_route_may_be_any_number_of_rounds_on() -> None:
 
 
 def test_truths_told_bit_by_bit_follow_a_session_once(mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def body(live: Live) -> None:
-        session_id, _ = await drive_session(live, [ranked(seed, 0.1) for seed in range(6)])
-        ranking = await truths_of(live).rank(session_id, [1.0] * 6)
-        journal, first_rows = live.store.journal, []
+    async def body(service: Service) -> None:
+        session_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(6)])
+        ranking = await truths_of(service).rank(session_id, [1.0] * 6)
+        journal, first_rows = service.store.journal, []
 
         def noting(number: int, sequence: int, last_sequence: int) -> object:
             first_rows.append(sequence)
             return journal(number, sequence, last_sequence)
 
-        monkeypatch.setattr(live.store, "journal", noting)
-        truths = truths_of(live)
+        monkeypatch.setattr(service.store, "journal", noting)
+        truths = truths_of(service)
         await truths.rank(session_id, [1.0] * 3 + [None] * 3)
         last_ranking = await truths.rank(session_id, [1.0] * 3, first=3)
         assert first_rows == [0, 3]

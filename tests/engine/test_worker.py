@@ -35,10 +35,10 @@ def test_an_error_reaches_the_one_who_asked_and_nobody_else(worker: InferenceWor
     def fail() -> None:
         raise InvalidInputError("no")
 
-    failing, sound = worker.submit(fail), worker.submit(lambda: 7)
+    failing_answer, sound_answer = worker.submit(fail), worker.submit(lambda: 7)
     with pytest.raises(InvalidInputError, match="no"):
-        failing.result(60)
-    assert sound.result(60) == 7
+        failing_answer.result(60)
+    assert sound_answer.result(60) == 7
 
 
 def test_closing_finishes_what_is_queued_and_takes_no_more() -> None:
@@ -57,12 +57,12 @@ def test_no_more_of_one_priority_wait_than_may(worker: InferenceWorker) -> None:
     worker.submit(lambda: (has_begun.set(), gate.wait(60)))
     assert has_begun.wait(60)
     for priority in (Priority.LIVE, Priority.BATCH):
-        waiting = [worker.submit(lambda: 1, priority) for _ in range(16)]
+        answers = [worker.submit(lambda: 1, priority) for _ in range(16)]
         with pytest.raises(OverloadedError) as caught:
             worker.submit(lambda: 1, priority)
         assert caught.value.hints["retry_after_s"] == 1
     gate.set()
-    assert [answer.result(60) for answer in waiting] == [1] * 16
+    assert [answer.result(60) for answer in answers] == [1] * 16
     assert worker.submit(lambda: 2).result(60) == 2
 
 

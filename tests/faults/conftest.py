@@ -161,11 +161,11 @@ class Service:
 
 def batch(first: int, n: int = N_PLACES) -> bytes:
     """A batch of `n` frames of a drive, from index `first` on, as an upload's body."""
-    packed = io.BytesIO()
+    file = io.BytesIO()
     index = np.arange(first, first + n)
     encodings = np.random.default_rng(7).normal(size=(first + n, DIM))[first:]
-    np.savez(packed, encodings=encodings.astype(np.float32), index=index, position_m=index * 1.0)
-    return packed.getvalue()
+    np.savez(file, encodings=encodings.astype(np.float32), index=index, position_m=index * 1.0)
+    return file.getvalue()
 
 
 REMAP = {

@@ -36,7 +36,7 @@ _ROOT = (
 
 @router.get("/")
 async def root(request: Request) -> Response:
-    """Where to go from here, for a browser as a page."""
+    """Links to the parts of the service, as a page for a browser, else as JSON."""
     if "text/html" in request.headers.get("accept", ""):
         return Response(_ROOT, media_type="text/html")
     return JSONResponse({"name": "Deep SIMBAD", "version": release(), **_LINKS})
@@ -79,7 +79,7 @@ async def calls() -> Response:
 
 @router.get("/docs/start.js")
 async def calls_start() -> Response:
-    """What draws the page."""
+    """The script that draws the page."""
     return Response(_CALLS_START, media_type="text/javascript", headers=_CACHE_AN_HOUR)
 
 
@@ -122,13 +122,13 @@ async def console() -> Response:
 
 @router.get("/console/")
 async def console_with_slash() -> Response:
-    """What was meant."""
+    """Redirect to the console's address without the slash."""
     return RedirectResponse("../console", 308)
 
 
 @router.get("/console/report.html")
 async def report() -> Response:
-    """Where a report is opened."""
+    """The page in which a report is opened."""
     return _file("report.html", _REPORT_POLICY)
 
 
@@ -136,7 +136,7 @@ async def report() -> Response:
 async def console_asset(
     name: Annotated[str, PathParameter(pattern=r"^[a-z][A-Za-z0-9.]*\.(js|css|svg|txt)$")],
 ) -> Response:
-    """What the page is made of."""
+    """A file of the console by its name."""
     if not (_FILES / name).is_file():
         raise HTTPException(404)
     return _file(name)

@@ -388,7 +388,7 @@ Body = TypeVar("Body", bound=JsonBody)
 
 
 def _with_nearest(finding: ErrorDetails, kind: type[Body]) -> ErrorDetails:
-    """What pydantic found, with the nearest spelling of an unknown member of a body, or of a choice."""
+    """A finding of pydantic, whose message names what is nearest to an unknown member of a body, or to a choice."""
     if finding["type"] == "extra_forbidden" and len(finding["loc"]) == 1:
         return {**finding, "msg": f"there is no such member{nearest_of(str(finding['loc'][0]), kind.model_fields)}"}
     choices = re.findall(r"'([^']*)'", str(finding.get("ctx", {}).get("expected", "")))

@@ -1,1 +1,1 @@
-"""What serves a query: core, store and evaluators composed."""
+"""Core, store and evaluators composed to serve queries."""

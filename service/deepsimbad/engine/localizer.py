@@ -235,7 +235,7 @@ def ready_encodings(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def shortlist_length(snapshot: Map, n_shortlist: int | None) -> int:
-    """How many map images a shortlist holds; raises InvalidInputError."""
+    """The length of a shortlist, the default where `n_shortlist` is None; raises InvalidInputError."""
     if n_shortlist is None:
         return min(DEFAULT_SHORTLIST, snapshot.n_images)
     if not 1 <= n_shortlist <= snapshot.n_images:
