@@ -41,7 +41,7 @@ def season(number, *noise):
     return Drive(position_m=np.arange(float(N)), encodings=np.hstack(halves))
 
 
-def halved(drive, half):
+def with_one_half(drive, half):
     """The drive with one half alone, as `encode` gives it."""
     encodings = np.zeros_like(drive.encodings)
     encodings[:, half * D : (half + 1) * D] = drive.encodings[:, half * D : (half + 1) * D]
@@ -52,7 +52,7 @@ def part(drive, half):
     return replace(drive, encodings=np.ascontiguousarray(drive.encodings[:, half * D : (half + 1) * D]))
 
 
-def scored(relevance, evaluator, landmarks, training, *tests):
+def score(relevance, evaluator, landmarks, training, *tests):
     config = VprConfig(60, relevances=(relevance,))
     maps = build_maps(config, Fitter(evaluator), evaluator, landmarks, training)
     truth = true_images_of(training.route(), training.route(), 2.0)
@@ -67,7 +67,7 @@ def scored(relevance, evaluator, landmarks, training, *tests):
 def test_the_weight_is_learnt_where_the_other_drive_saw_the_same_places(worse):
     noise = [1.0, 1.0]
     noise[worse] = 2.0
-    built_map, _ = scored(Relevance.RRF, FUSED, season(1, *noise), season(2, *noise))
+    built_map, _ = score(Relevance.RRF, FUSED, season(1, *noise), season(2, *noise))
     weight, fitting = float(built_map.map.landmark_model["fused_weight"][0]), built_map.fitting
     assert (weight < 0.5) == (worse == 0)
     assert (fitting["weight"], fitting["n_shared_places"]) == (pytest.approx(weight), N)
@@ -80,14 +80,14 @@ def test_the_weight_is_learnt_where_the_other_drive_saw_the_same_places(worse):
 def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better():
     noise = (2.0, 2.0)
     landmarks, training, test = (season(number, *noise) for number in (1, 2, 3))
-    composed, (whole_anr, first, second) = scored(
-        Relevance.COMPOSED, FUSED, landmarks, training, test, halved(test, 0), halved(test, 1)
+    composed, (whole_anr, first, second) = score(
+        Relevance.COMPOSED, FUSED, landmarks, training, test, with_one_half(test, 0), with_one_half(test, 1)
     )
     for half, half_anr in enumerate((first, second)):
-        _, (own_anr,) = scored(Relevance.COMPOSED, ALONE, *(part(drive, half) for drive in (landmarks, training, test)))
+        _, (own_anr,) = score(Relevance.COMPOSED, ALONE, *(part(drive, half) for drive in (landmarks, training, test)))
         assert own_anr > 1, "else there is nothing to lose"
         assert whole_anr < half_anr < 1.4 * own_anr
-    view = DriveViews(halved(test, 0), FUSED).by(composed.map.landmark_model).at(0)
+    view = DriveViews(with_one_half(test, 0), FUSED).by(composed.map.landmark_model).at(0)
     map_statistics = composed.map.live_statistics
     live_statistics = map_statistics.observing(view)
     np.testing.assert_array_equal(
@@ -97,7 +97,7 @@ def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better
 
 
 def test_what_an_encoder_broke_does_not_pass_for_a_half_that_is_missing():
-    composed, _ = scored(Relevance.COMPOSED, FUSED, season(1, 1.0, 1.0), season(2, 1.0, 1.0))
+    composed, _ = score(Relevance.COMPOSED, FUSED, season(1, 1.0, 1.0), season(2, 1.0, 1.0))
     model, broken = composed.map.landmark_model, season(3, 1.0, 1.0).encodings[:2].copy()
     broken[0, D:] = np.nan
     with pytest.raises(InvalidEncodingError):

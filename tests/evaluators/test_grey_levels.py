@@ -28,7 +28,7 @@ STRETCHED = {
 }
 
 
-def filled(folder, deepen, n=6, form="png"):
+def make_recording(folder, deepen, n=6, form="png"):
     folder.mkdir()
     for number in range(n):
         cv2.imwrite(str(folder / f"{number}.{form}"), deepen(picture(number).astype(float)).astype(np.uint16))
@@ -42,7 +42,7 @@ def posted_picture(recording, number, size=None):
 @pytest.mark.parametrize("form", ["png", "tiff", "pgm"])
 @pytest.mark.parametrize("bits", WHOLE_DEPTHS)
 def test_a_camera_that_fills_the_low_bits_shows_its_own_eight(tmp_path, bits, form):
-    recording = filled(tmp_path / "drive", lambda grey: grey * WHOLE_DEPTHS[bits], form=form)
+    recording = make_recording(tmp_path / "drive", lambda grey: grey * WHOLE_DEPTHS[bits], form=form)
     assert recording.grey_levels == (0, 2 ** int(bits) - 1)
     for number in range(6):
         np.testing.assert_array_equal(posted_picture(recording, number), picture(number))
@@ -51,7 +51,7 @@ def test_a_camera_that_fills_the_low_bits_shows_its_own_eight(tmp_path, bits, fo
 
 @pytest.mark.parametrize("kind", STRETCHED)
 def test_a_part_of_the_range_is_stretched_over_the_whole_recording(tmp_path, kind):
-    recording = filled(tmp_path / "drive", STRETCHED[kind])
+    recording = make_recording(tmp_path / "drive", STRETCHED[kind])
     for number in range(6):
         grey = posted_picture(recording, number).astype(float)
         assert np.corrcoef(grey.ravel(), picture(number).ravel())[0, 1] > 0.99
@@ -61,7 +61,7 @@ def test_a_part_of_the_range_is_stretched_over_the_whole_recording(tmp_path, kin
 
 def test_a_lens_cap_at_either_end_tells_no_levels(tmp_path):
     folder = tmp_path / "drive"
-    filled(folder, lambda grey: grey * 16, n=30)
+    make_recording(folder, lambda grey: grey * 16, n=30)
     noise = np.random.default_rng(0)
     for number in (0, 1, 2, 28, 29):
         cv2.imwrite(str(folder / f"{number}.png"), noise.integers(60, 70, (120, 160), np.uint16))

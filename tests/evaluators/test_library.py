@@ -80,9 +80,11 @@ def test_a_lock_is_read_as_it_was_written(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["weights.lock"]
     (tmp_path / "new" / "x.onnx").write_bytes(b"another")
     (tmp_path / "new" / "mine.onnx").write_bytes(b"mine")
-    assert lock.pinned("mine.onnx")[1] == file_sha256(tmp_path / "new" / "mine.onnx"), "what nobody recorded is taken"
+    assert lock.pinned_file("mine.onnx")[1] == file_sha256(tmp_path / "new" / "mine.onnx"), (
+        "what nobody recorded is taken"
+    )
     with pytest.raises(InvalidWeightsError, match="was recorded with 1111"):
-        lock.pinned("x.onnx")
+        lock.pinned_file("x.onnx")
 
 
 def test_a_file_that_lies_here_is_recorded_as_it_is(tmp_path):

@@ -29,11 +29,11 @@ FAMILIES = sorted(NETVLAD_WRITERS)
 PRECISIONS = [(Runtime.TORCH, 0.9999), (Runtime.TORCH_BF16, 0.999)]
 
 
-def loaded(make, path, runtime=Runtime.TORCH, largest_batch=0):
+def load(make, path, runtime=Runtime.TORCH, largest_batch=0):
     return make(path.name, Compute(runtime, Device.CPU, largest_batch=largest_batch, weights_dir=path.parent))
 
 
-def encoded(module, image):
+def encode(module, image):
     with torch.inference_mode():
         return module.eval()(torch.from_numpy(image[None]))[0].numpy()
 
@@ -52,7 +52,7 @@ def test_netvlad_agrees_with_the_equations(tmp_path, family):
     image = scene(90, 118) if family == "matlab" else scene(480, 640)
     expected = netvlad_encoding(network, image, np.float32)
     for runtime, least_cosine in PRECISIONS:
-        extractor = loaded(netvlad, path, runtime)
+        extractor = load(netvlad, path, runtime)
         assert extractor.input_size == (None if family == "matlab" else (640, 480))
         encodings = extractor.encode([image])
         assert encodings.shape == (1, extractor.encoding_dim)
@@ -63,7 +63,7 @@ def test_names_of_several_devices(tmp_path):
     network, image = random_network("pytorch_netvlad"), scene(64, 80)
     references.write_pytorch_netvlad(tmp_path / "parallel", network, "module.")
     references.write_pytorch_netvlad(tmp_path / "alone", network)
-    parallel, alone = (encoded(read_netvlad(tmp_path / name).module(), image) for name in ("parallel", "alone"))
+    parallel, alone = (encode(read_netvlad(tmp_path / name).module(), image) for name in ("parallel", "alone"))
     np.testing.assert_array_equal(parallel, alone)
 
 
@@ -77,7 +77,7 @@ def test_double_precision_is_brought_to_single(tmp_path):
 
 def test_matlabs_aspect_is_kept_and_the_longer_side_reduced_to_1024(tmp_path):
     path, network = write_network(tmp_path, "matlab")
-    extractor = loaded(netvlad, path, largest_batch=4)
+    extractor = load(netvlad, path, largest_batch=4)
     assert extractor.prepare(scene(60, 100)).shape == (60, 100, 3)
     assert extractor.prepare(scene(700, 1400)).shape == (512, 1024, 3)
     assert extractor.prepare(scene(4, 300)).shape == (16, 300, 3)  # of fewer rows nothing would be left
@@ -92,13 +92,13 @@ def test_weights_laid_out_for_the_processor_are_made_anew_after_a_cast(tmp_path)
     image = scene(64, 80)
     module = read_netvlad(path).module().requires_grad_(False)
     expected = netvlad_encoding(network, image)
-    assert cosine(encoded(module, image), expected) > 0.9999
+    assert cosine(encode(module, image), expected) > 0.9999
     module.trunk.to(torch.bfloat16)
-    assert cosine(encoded(module, image), expected) > 0.999
+    assert cosine(encode(module, image), expected) > 0.999
     with torch.no_grad():
         first = next(module.trunk.parameters())
         first.data = torch.zeros_like(first)
-    assert cosine(encoded(module, image), expected) < 0.999
+    assert cosine(encode(module, image), expected) < 0.999
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_full_shapes(tmp_path):
     weights = read_netvlad(path)
     path.unlink()
     assert weights.encoding_dim == 4096
-    assert cosine(encoded(weights.module(), image), netvlad_encoding(network, image, np.float32)) > 0.9999
+    assert cosine(encode(weights.module(), image), netvlad_encoding(network, image, np.float32)) > 0.9999
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_squeezenet_agrees_with_the_papers_table(tmp_path, parameters, family):
         np.testing.assert_allclose(actual[0].numpy(), expected_map, rtol=1e-3, atol=1e-4 * expected_map.max())
     encoding = unit(np.concatenate([references.grid(expected[fire], *CELLS) for fire in OUTPUT_FIRES]))
     for runtime, least_cosine in PRECISIONS:
-        extractor = loaded(squeezenet, path, runtime)
+        extractor = load(squeezenet, path, runtime)
         assert (extractor.input_size, extractor.encoding_dim) == ((SIDES[family],) * 2, ENCODING_DIM)
         assert cosine(extractor.encode([image])[0], encoding) > least_cosine
     other = "torchvision" if family == "caffe" else "caffe"  # the comparison tells another family's pixels
@@ -151,9 +151,9 @@ def test_squeezenet_agrees_with_the_papers_table(tmp_path, parameters, family):
 def test_squeezenet_in_onnxruntime_agrees(tmp_path, parameters):
     path, image = tmp_path / "weights", scene(227, 227)
     references.write_caffe(path, parameters)
-    encodings = loaded(squeezenet, path, Runtime.ONNXRUNTIME).encode([image, image[::-1]])
+    encodings = load(squeezenet, path, Runtime.ONNXRUNTIME).encode([image, image[::-1]])
     assert [file.suffix for file in (tmp_path / "exported").iterdir()] == [".onnx"]
-    for encoding, expected in zip(encodings, loaded(squeezenet, path).encode([image, image[::-1]]), strict=True):
+    for encoding, expected in zip(encodings, load(squeezenet, path).encode([image, image[::-1]]), strict=True):
         assert cosine(encoding, expected) > 0.9999
 
 
@@ -168,4 +168,4 @@ def test_the_published_squeezenet(real_data):
     image = scene(227, 227)
     expected = squeezenet_encoding(published, image, "caffe")
     for runtime, least_cosine in PRECISIONS:
-        assert cosine(loaded(squeezenet, path, runtime).encode([image])[0], expected) > least_cosine
+        assert cosine(load(squeezenet, path, runtime).encode([image])[0], expected) > least_cosine

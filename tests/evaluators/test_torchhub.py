@@ -103,13 +103,13 @@ def leave_archive(folder, files, repository=REPOSITORY, commit=COMMIT):
     return path
 
 
-def pulled(folder, entry="entry", files=None, **wish):
+def pull(folder, entry="entry", files=None, **wish):
     leave_archive(folder, files or {"hubconf.py": HUBCONF, "places_model.py": MODEL})
     wish = {"commit": COMMIT, "input_size": SIZE, **wish}
     return pull_hub(folder, HubWish(f"torchhub:{REPOSITORY}:{entry}", **wish), lambda *_: None)
 
 
-def loaded(folder, entry="entry", **compute):
+def load(folder, entry="entry", **compute):
     return torchhub(f"{REPOSITORY}:{entry}", Compute(weights_dir=folder, device=Device.CPU, **compute))
 
 
@@ -141,10 +141,10 @@ def by_hand(image, dim=8):
 
 
 def test_an_entry_encodes_as_its_model_says(tmp_path, capfd):
-    record = pulled(tmp_path)
+    record = pull(tmp_path)
     assert (record.encoding_dim, record.input_size, record.beside) == (8, SIZE, {})
     capfd.readouterr()
-    extractor = loaded(tmp_path)
+    extractor = load(tmp_path)
     assert capfd.readouterr() == ("", "")
     images = [np.ascontiguousarray(np.random.default_rng(i).integers(0, 255, (42, 28, 3), np.uint8)) for i in range(3)]
     encodings = extractor.encode(images)
@@ -164,19 +164,19 @@ def test_an_entry_encodes_as_its_model_says(tmp_path, capfd):
 )
 def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, entry, arguments):
     """Also of several outputs, of one that sees nothing, and of a model for several devices."""
-    pulled(tmp_path, entry, arguments=arguments)
-    extractor = loaded(tmp_path, entry, largest_batch=2)
+    pull(tmp_path, entry, arguments=arguments)
+    extractor = load(tmp_path, entry, largest_batch=2)
     encodings = extractor.encode(scenes())
     np.testing.assert_allclose(np.linalg.norm(encodings, axis=1), 1, rtol=1e-3)
     np.testing.assert_allclose(encodings, [extractor.encode([image])[0] for image in scenes()], atol=3e-4)
 
 
 def test_by_itself_it_is_computed_in_float32(tmp_path):
-    pulled(tmp_path)
-    by_itself, in_float32 = loaded(tmp_path).encode(scenes()), loaded(tmp_path, runtime=Runtime.TORCH).encode(scenes())
+    pull(tmp_path)
+    by_itself, in_float32 = load(tmp_path).encode(scenes()), load(tmp_path, runtime=Runtime.TORCH).encode(scenes())
     np.testing.assert_array_equal(by_itself, in_float32)
     with contextlib.suppress(InvalidWeightsError):  # a model may be unable to; this one is not
-        np.testing.assert_allclose(loaded(tmp_path, runtime=Runtime.TORCH_BF16).encode(scenes()), in_float32, atol=0.05)
+        np.testing.assert_allclose(load(tmp_path, runtime=Runtime.TORCH_BF16).encode(scenes()), in_float32, atol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -200,29 +200,29 @@ def test_by_itself_it_is_computed_in_float32(tmp_path):
 )
 def test_what_gives_no_encodings_is_not_recorded(tmp_path, entry, arguments, message):
     with pytest.raises(InvalidWeightsError, match=message):
-        pulled(tmp_path, entry, arguments=arguments)
+        pull(tmp_path, entry, arguments=arguments)
     assert not (tmp_path / LOCK).exists()
     with pytest.raises(MissingWeightsError, match=f"weights pull torchhub:{REPOSITORY}:{entry}"):
-        loaded(tmp_path, entry)
+        load(tmp_path, entry)
 
 
 @pytest.mark.parametrize("dim", [10**12, 10**15])
 def test_a_model_that_does_not_fit_the_memory_is_no_invalid_one(tmp_path, dim):
     with pytest.raises(OutOfMemoryError):
-        pulled(tmp_path, arguments={"dim": dim})
+        pull(tmp_path, arguments={"dim": dim})
 
 
 @pytest.mark.parametrize("is_listed", [True, False])
 def test_a_package_that_it_needs_is_named(tmp_path, is_listed):
     text = HUBCONF.replace('["torch"]', '["torch", "a_package_nobody_has"]') if is_listed else HUBCONF
     with pytest.raises(MissingPackageError, match="needs a_package_nobody_has"):
-        pulled(tmp_path, "entry" if is_listed else "needing", {"hubconf.py": text, "places_model.py": MODEL})
+        pull(tmp_path, "entry" if is_listed else "needing", {"hubconf.py": text, "places_model.py": MODEL})
 
 
 def test_a_module_that_the_repository_lacks_itself_is_no_package(tmp_path):
     model = MODEL.replace("import torch", "import torch\nfrom places_model.other import x", 1)
     with pytest.raises(InvalidWeightsError, match="cannot be made: ModuleNotFoundError"):
-        pulled(tmp_path, files={"hubconf.py": HUBCONF, "places_model.py": model})
+        pull(tmp_path, files={"hubconf.py": HUBCONF, "places_model.py": model})
 
 
 def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypatch):
@@ -234,21 +234,21 @@ def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypa
         torch.save({"project.weight": torch.ones(8, 12)}, target)
 
     monkeypatch.setattr(downloads, "fetch", fetch)
-    record = pulled(tmp_path, "checkpoint")
+    record = pull(tmp_path, "checkpoint")
     assert requests == [("http://127.0.0.1:9/places.pth", None)]
     checkpoint = tmp_path / "hub" / "checkpoints" / "places.pth"
     assert list(record.beside) == ["checkpoints/places.pth"]
-    np.testing.assert_allclose(np.abs(loaded(tmp_path, "checkpoint").encode(scenes())), 8**-0.5, rtol=1e-3)
+    np.testing.assert_allclose(np.abs(load(tmp_path, "checkpoint").encode(scenes())), 8**-0.5, rtol=1e-3)
     checkpoint.unlink()
     with pytest.raises(MissingWeightsError, match=r"places\.pth is missing"):
-        loaded(tmp_path, "checkpoint")
+        load(tmp_path, "checkpoint")
     torch.save({"project.weight": torch.zeros(8, 12)}, checkpoint)
     with pytest.raises(InvalidWeightsError, match=f"recorded with {record.beside['checkpoints/places.pth']}"):
-        loaded(tmp_path, "checkpoint")
+        load(tmp_path, "checkpoint")
     with pytest.raises(InvalidWeightsError, match="remove it"):
-        pulled(tmp_path, "checkpoint")
+        pull(tmp_path, "checkpoint")
     checkpoint.unlink()
-    again = pulled(tmp_path, "checkpoint")
+    again = pull(tmp_path, "checkpoint")
     assert again == record
     assert requests[1:] == [("http://127.0.0.1:9/places.pth", record.beside["checkpoints/places.pth"])]
 
@@ -256,22 +256,22 @@ def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypa
 def test_a_pull_without_a_network_says_what_to_put_where(tmp_path):
     place = tmp_path / "hub" / "checkpoints" / "places.pth"
     with pytest.raises(MissingWeightsError, match=r"127\.0\.0\.1:9/places\.pth cannot be reached") as error:
-        pulled(tmp_path, "checkpoint")
+        pull(tmp_path, "checkpoint")
     assert str(place) in error.value.message
     torch.save({"project.weight": torch.ones(8, 12)}, place)
-    assert list(pulled(tmp_path, "checkpoint").beside) == ["checkpoints/places.pth"]
+    assert list(pull(tmp_path, "checkpoint").beside) == ["checkpoints/places.pth"]
 
 
 def test_loading_asks_nothing_of_a_network(tmp_path):
     """Neither an entry that swallows the first refusal, nor one whose record does not hold its download."""
     with pytest.raises(InvalidWeightsError, match="ConnectionRefusedError"):
-        pulled(tmp_path, "secret")
-    record = pulled(tmp_path)
+        pull(tmp_path, "secret")
+    record = pull(tmp_path)
     for entry, address in (("secret", "127.0.0.1"), ("checkpoint", "http://127.0.0.1:9/places.pth for ")):
         lock = Lock.read(tmp_path)
         lock.with_hub(f"torchhub:{REPOSITORY}:{entry}", replace(record, arguments={})).write()
         with pytest.raises(MissingWeightsError, match="nothing is downloaded while it is loaded") as error:
-            loaded(tmp_path, entry)
+            load(tmp_path, entry)
         assert address in error.value.message
 
 
@@ -282,26 +282,26 @@ def test_other_repositories_that_it_loads_are_recorded_too(tmp_path, monkeypatch
     (inner / "hubconf.py").write_text("from inner_model import Inner\n\ndef backbone():\n    return Inner()\n")
     (inner / "inner_model.py").write_text("from torch.nn import Identity as Inner\n")
     monkeypatch.setattr("torch.hub._parse_repo_info", lambda github: (*github.split("/"), "main"))
-    record = pulled(tmp_path, "nested")
+    record = pull(tmp_path, "nested")
     assert list(record.beside) == ["elsewhere_backbone_main"]
-    assert loaded(tmp_path, "nested").encoding_dim == 8
+    assert load(tmp_path, "nested").encoding_dim == 8
     (inner / "README").write_text("changed")
     with pytest.raises(InvalidWeightsError, match="elsewhere_backbone_main has sha256"):
-        loaded(tmp_path, "nested")
+        load(tmp_path, "nested")
 
 
 def test_repositories_may_have_modules_of_one_name(tmp_path):
-    pulled(tmp_path)
+    pull(tmp_path)
     files = {"hubconf.py": HUBCONF, "places_model.py": MODEL.replace("means)", "-means)")}
     leave_archive(tmp_path, files, "another/Places")
     pull_hub(tmp_path, HubWish("torchhub:another/Places:entry", COMMIT, input_size=SIZE), lambda *_: None)
     another = torchhub("another/Places:entry", Compute(weights_dir=tmp_path, device=Device.CPU))
-    np.testing.assert_allclose(another.encode(scenes()), -loaded(tmp_path).encode(scenes()), atol=3e-4)
+    np.testing.assert_allclose(another.encode(scenes()), -load(tmp_path).encode(scenes()), atol=3e-4)
 
 
 @pytest.mark.parametrize("change", ["changed", "added", "removed", "gone"])
 def test_a_tree_that_was_changed_is_not_run(tmp_path, change):
-    record = pulled(tmp_path)
+    record = pull(tmp_path)
     tree = tmp_path / "hub" / record.folder
     mark = tmp_path / "was-run"
     evil = f"open({str(mark)!r}, 'w')\n"
@@ -315,47 +315,47 @@ def test_a_tree_that_was_changed_is_not_run(tmp_path, change):
         tree.rename(tmp_path / "elsewhere")
     error_type = MissingWeightsError if change == "gone" else InvalidWeightsError
     with pytest.raises(error_type) as error:
-        loaded(tmp_path)
+        load(tmp_path)
     assert not mark.exists()
     assert record.folder in error.value.message
     if change != "gone":
         assert record.tree_sha256 in error.value.message
-    assert pulled(tmp_path) == record, "a pull mends it"
-    assert loaded(tmp_path).encoding_dim == 8
+    assert pull(tmp_path) == record, "a pull mends it"
+    assert load(tmp_path).encoding_dim == 8
 
 
 def test_an_archive_of_the_same_commit_must_be_the_same(tmp_path):
-    record = pulled(tmp_path)
+    record = pull(tmp_path)
     (tmp_path / "hub" / record.folder / "hubconf.py").write_text("")
     mark = tmp_path / "was-run"
     files = {"hubconf.py": f"open({str(mark)!r}, 'w')\n{HUBCONF}", "places_model.py": MODEL}
     with pytest.raises(InvalidWeightsError, match=record.tree_sha256):
-        pulled(tmp_path, files=files)
+        pull(tmp_path, files=files)
     assert not mark.exists()
     with pytest.raises(InvalidWeightsError, match="should have 00000000"):
-        pulled(tmp_path, sha256="00000000")
-    assert pulled(tmp_path) == record
+        pull(tmp_path, sha256="00000000")
+    assert pull(tmp_path) == record
 
 
 def test_what_python_keeps_of_a_tree_is_neither_read_nor_counted(tmp_path):
-    record = pulled(tmp_path)
+    record = pull(tmp_path)
     tree = tmp_path / "hub" / record.folder
     assert not (tree / "__pycache__").exists()
     (tree / "__pycache__").mkdir()
     (tree / "__pycache__" / f"places_model.{sys.implementation.cache_tag}.pyc").write_bytes(b"no code at all")
-    assert loaded(tmp_path).encoding_dim == 8
+    assert load(tmp_path).encoding_dim == 8
 
 
 def test_the_dimension_that_is_known_must_come(tmp_path):
-    pulled(tmp_path)
+    pull(tmp_path)
     text = (tmp_path / LOCK).read_text()
     (tmp_path / LOCK).write_text(text.replace('"encoding_dim": 8', '"encoding_dim": 9'))
     with pytest.raises(InvalidWeightsError, match="encodings of 8 numbers, not 9"):
-        loaded(tmp_path)
+        load(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"version": 2}', '{"hub": {"x": {}}}', '{"files": {"x": {"sha256": "1"}}}'])
 def test_a_damaged_lock_is_named(tmp_path, text):
     (tmp_path / LOCK).write_text(text)
     with pytest.raises(InvalidWeightsError, match=r"weights\.lock is no lock"):
-        loaded(tmp_path)
+        load(tmp_path)

@@ -31,7 +31,7 @@ def load(path, extractor=netvlad):
     return extractor(path.name, Compute(Runtime.TORCH, Device.CPU, weights_dir=path.parent))
 
 
-def refused(path, message=None, extractor=netvlad):
+def assert_refused(path, message=None, extractor=netvlad):
     with pytest.raises(InvalidWeightsError, match=message) as caught:
         load(path, extractor)
     assert path.name in caught.value.message
@@ -60,7 +60,7 @@ def test_a_truncated_file(tmp_path, family):
     body = path.read_bytes()
     for share in (0.0, 0.001, 0.1, 0.5, 0.97):
         path.write_bytes(body[: int(len(body) * share)])
-        refused(path, extractor=extractor)
+        assert_refused(path, extractor=extractor)
 
 
 def test_a_truncated_file_that_was_not_compressed(tmp_path):
@@ -69,7 +69,7 @@ def test_a_truncated_file_that_was_not_compressed(tmp_path):
     body = path.read_bytes()
     for n_bytes in (130, 200, len(body) // 2, len(body) - 1):
         path.write_bytes(body[:n_bytes])
-        refused(path, "no whole MATLAB file")
+        assert_refused(path, "no whole MATLAB file")
 
 
 @pytest.mark.parametrize("extractor", EXTRACTORS)
@@ -80,7 +80,7 @@ def test_a_truncated_file_that_was_not_compressed(tmp_path):
 )  # fmt: skip
 def test_no_file_of_weights_at_all(tmp_path, body, extractor):
     (tmp_path / "file").write_bytes(body)
-    refused(tmp_path / "file", extractor=extractor)
+    assert_refused(tmp_path / "file", extractor=extractor)
 
 
 @pytest.mark.parametrize("family", NETVLAD_WRITERS)
@@ -105,25 +105,25 @@ def test_a_parameter_too_many_or_too_few_is_another_network(tmp_path, family):
     if extractor is netvlad:  # of SqueezeNet the head is passed over
         names[f"{first}_more"] = names[first]
         torch.save(content, path)
-        refused(path, "another network")
+        assert_refused(path, "another network")
         del names[f"{first}_more"]
     del names[first]
     torch.save(content, path)
-    refused(path, first if extractor is netvlad else r"stem\.weight", extractor)
+    assert_refused(path, first if extractor is netvlad else r"stem\.weight", extractor)
 
 
 @pytest.mark.parametrize("extractor", EXTRACTORS)
 @pytest.mark.parametrize("content", [{}, [], 3, {"state_dict": 3}, {"features.0.weight": torch.zeros(3)}])
 def test_a_checkpoint_of_no_family(tmp_path, content, extractor):
     torch.save(content, tmp_path / "other.pth")
-    refused(tmp_path / "other.pth", extractor=extractor)
+    assert_refused(tmp_path / "other.pth", extractor=extractor)
 
 
 def test_openibl_without_its_whitening(tmp_path):
     """Its training keeps the whitening in another file; without it the encoding would not be what is published."""
     names = references.torch_names(random_network("openibl"), "base_model.base.{}", "net_vlad.{}", "pca_layer")
     torch.save({name: tensor for name, tensor in names.items() if "pca" not in name}, tmp_path / "model.pth.tar")
-    refused(tmp_path / "model.pth.tar")
+    assert_refused(tmp_path / "model.pth.tar")
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_openibl_without_its_whitening(tmp_path):
 def test_wrong_tensors(tmp_path, name, tensor):
     path = tmp_path / "patch.pth.tar"
     references.write_patch_netvlad(path, random_network("patch_netvlad"), **{name: tensor})
-    refused(path)
+    assert_refused(path)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_wrong_tensors(tmp_path, name, tensor):
 def test_wrong_arrays(tmp_path, name, array):
     changed = {key: value for key, value in (PARAMETERS | {name: array}).items() if value is not None}
     references.write_caffe(tmp_path / "weights.npz", changed)
-    refused(tmp_path / "weights.npz", extractor=squeezenet)
+    assert_refused(tmp_path / "weights.npz", extractor=squeezenet)
 
 
 def weights_of(layer, *arrays):
@@ -205,14 +205,14 @@ def test_a_matlab_file_of_another_network(tmp_path, change):
     net = references.matlab_net(random_network("matlab"))
     change(net)
     savemat(tmp_path / "net.mat", {"net": net})
-    refused(tmp_path / "net.mat")
+    assert_refused(tmp_path / "net.mat")
 
 
 def test_a_matlab_file_without_the_struct(tmp_path):
     savemat(tmp_path / "other.mat", {"dbStruct": {"utm": np.zeros((3, 2))}})
-    refused(tmp_path / "other.mat", "no variable net")
+    assert_refused(tmp_path / "other.mat", "no variable net")
     savemat(tmp_path / "other.mat", {"net": np.zeros(3)})
-    refused(tmp_path / "other.mat", "another network")
+    assert_refused(tmp_path / "other.mat", "another network")
 
 
 def element(kind, body):
@@ -232,7 +232,7 @@ def test_cells_inside_cells_do_not_end_the_process(tmp_path):
         parts.append(struct.pack("<II", 14, len(head) + n_bytes) + head)
         n_bytes += 8 + len(head)
     (tmp_path / "deep").write_bytes(HEADER + element(14, array(1, (1, 1), b"".join(reversed(parts)), b"net")))
-    refused(tmp_path / "deep", "nested deeper")
+    assert_refused(tmp_path / "deep", "nested deeper")
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_cells_inside_cells_do_not_end_the_process(tmp_path):
 )
 def test_sizes_that_cannot_be(tmp_path, body):
     (tmp_path / "sizes").write_bytes(HEADER + element(14, body))
-    refused(tmp_path / "sizes", "no whole MATLAB file")
+    assert_refused(tmp_path / "sizes", "no whole MATLAB file")
 
 
 def test_what_is_no_number_text_cell_or_struct_is_passed_over(tmp_path):
@@ -286,14 +286,14 @@ def archive_bomb(path, member="archive/data/0"):
 )
 def test_a_file_that_unpacks_without_end(tmp_path, write, extractor):
     write(tmp_path / "bomb")
-    refused(tmp_path / "bomb", "unpacks to", extractor)
+    assert_refused(tmp_path / "bomb", "unpacks to", extractor)
 
 
 def test_an_array_that_claims_more_than_it_holds(tmp_path):
     header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1099511627776, 96), }".ljust(117) + b"\n"
     with zipfile.ZipFile(tmp_path / "weights.npz", "w") as archive:
         archive.writestr("conv1/w.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
-    refused(tmp_path / "weights.npz", extractor=squeezenet)
+    assert_refused(tmp_path / "weights.npz", extractor=squeezenet)
 
 
 class _Sentinel:
@@ -312,11 +312,11 @@ def test_code_in_a_file_is_not_run(tmp_path, extractor):
     content = {"state_dict": {"pool.centroids": _Sentinel(sentinel)}, "features.0.weight": _Sentinel(sentinel)}
     for zipped in (True, False):
         torch.save(content, path, _use_new_zipfile_serialization=zipped)
-        refused(path, "more than tensors", extractor)
+        assert_refused(path, "more than tensors", extractor)
     references.write_caffe(path, PARAMETERS | {"conv1/w": np.array([_Sentinel(sentinel)], object)})
-    refused(path, extractor=extractor)
+    assert_refused(path, extractor=extractor)
     path.write_bytes(pickle.dumps(content))
-    refused(path, extractor=extractor)
+    assert_refused(path, extractor=extractor)
     assert not sentinel.exists()
     pickle.loads(path.read_bytes())
     assert sentinel.exists()  # and it would have

@@ -189,7 +189,7 @@ class WaitsForTheOther:
         return self.run(job, on_progress, is_cancelled)
 
 
-def filled(client, name):
+def make_filled_domain(client, name):
     """A domain with a drive."""
     assert client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS).status_code == 201
     client.upload(name, "drive", ready_encodings(), 2.0 * np.arange(len(ready_encodings())))
@@ -233,7 +233,7 @@ def names():
 @of_fleet
 def test_two_domains_are_filled_and_mapped_at_once_and_listed_together(client, data_dir, names):
     for name in names:
-        filled(client, name)
+        make_filled_domain(client, name)
     folders = data_dir, data_dir / "administrators" / "1"
     for name, folder, other_folder in zip(names, folders, folders[::-1], strict=True):
         assert traverse_path(folder, name, "drive").exists()
@@ -303,12 +303,12 @@ def test_another_number_moves_no_domain(tmp_path: Path):
     names = administered_by(1)
     earlier_name, later_name = next(names), next(names)
     with running(settings, make_run_job=InThisProcess) as fleet, Caller(base_url=fleet.url, timeout=120) as client:
-        filled(client, earlier_name)  # which would be the second's, had it been there
+        make_filled_domain(client, earlier_name)  # which would be the second's, had it been there
     with (
         running(settings, make_run_job=InThisProcess, n_administrators=2) as fleet,
         Caller(base_url=fleet.url, timeout=120) as client,
     ):
-        filled(client, later_name)
+        make_filled_domain(client, later_name)
         for name in (earlier_name, later_name):
             assert client.remap(name, **CONFIG)["state"] == "succeeded"
     with running(settings, make_run_job=InThisProcess) as fleet, Caller(base_url=fleet.url, timeout=120) as client:

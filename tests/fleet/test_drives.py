@@ -69,7 +69,7 @@ def encoded_blocks(drive: Path, folder: Path, on_progress: Any, kind: str = "gra
     evaluator = make_evaluator(configuration, Compute())
     recording = read_folder(drive, 1.0)
     arguments = (recording, evaluator, dict(configuration.as_dict()), Compute(), 50_000_000)
-    return list(drives.encoded_elsewhere(*arguments, folder, on_progress))
+    return list(drives.cluster_blocks(*arguments, folder, on_progress))
 
 
 class Noon(datetime):
@@ -114,7 +114,7 @@ def test_a_drive_in_an_object_store_is_copied_and_makes_the_same_map(
         assert run([*many, f"{url}#5:"]) == 1
         assert "no objects" in capsys.readouterr().err
         shutil.copytree(drive, bucket.folder / "drives" / drive.name)
-        monkeypatch.setattr(drives, "encoded_elsewhere", lambda *_: pytest.fail("killed"))
+        monkeypatch.setattr(drives, "cluster_blocks", lambda *_: pytest.fail("killed"))
         with pytest.raises(pytest.fail.Exception):
             run([*many, f"{url}#5:"])
         monkeypatch.undo()

@@ -92,7 +92,7 @@ class Administering(Backend):
         return [start, {"type": "http.response.body", "body": self.body}]
 
 
-def answered(path, *administering):
+def front_answer(path, *administering):
     """The status and body of the front's answer where these administer."""
     fleet_front = Front.__new__(Front)
     fleet_front._administrators, fleet_front._replicas = Administrators(administering), []
@@ -109,17 +109,17 @@ def answered(path, *administering):
     return messages[0]["status"], body.decode()
 
 
-def ready(*damaged):
+def ready_administrator(*damaged):
     return Administering(body=json.dumps({"status": "ready", "damaged_maps": damaged}).encode())
 
 
 def test_a_fleet_is_ready_when_all_that_administer_are():
-    status, body = answered("/readyz", ready("b"), ready("a", "b"))
+    status, body = front_answer("/readyz", ready_administrator("b"), ready_administrator("a", "b"))
     assert (status, json.loads(body)) == (200, {"status": "ready", "damaged_maps": ["a", "b"]})
     full = Administering(HTTPStatus.SERVICE_UNAVAILABLE, b"the disk is full")
-    assert answered("/readyz", ready(), full) == (503, "the disk is full")
-    for pair in ((ready(), Administering()), (Administering(), full)):
-        status, body = answered("/readyz", *pair)
+    assert front_answer("/readyz", ready_administrator(), full) == (503, "the disk is full")
+    for pair in ((ready_administrator(), Administering()), (Administering(), full)):
+        status, body = front_answer("/readyz", *pair)
         assert (status, json.loads(body)["code"]) == (503, "unavailable")
 
 
@@ -132,9 +132,9 @@ def test_of_several_that_administer_the_disk_and_readiness_of_the_worst_are_told
     fine, full, broken = (
         Administering(body=health(*gauges).encode()) for gauges in ((1.0, 90.0, 1.0), (1.0, 2.0, 2.0), (0.0, 50.0, 4.0))
     )
-    assert answered("/metrics", fine, full) == (200, health(1.0, 2.0, 3.0))
-    assert answered("/metrics", fine, broken) == (200, health(0.0, 50.0, 5.0))
-    assert answered("/metrics", Administering(), fine) == (200, health(1.0, 90.0, 1.0))
+    assert front_answer("/metrics", fine, full) == (200, health(1.0, 2.0, 3.0))
+    assert front_answer("/metrics", fine, broken) == (200, health(0.0, 50.0, 5.0))
+    assert front_answer("/metrics", Administering(), fine) == (200, health(1.0, 90.0, 1.0))
 
 
 class Stuck(Backend):
@@ -149,12 +149,12 @@ class Stuck(Backend):
 
 def test_who_does_not_answer_soon_hangs_no_answer_of_the_others(monkeypatch):
     monkeypatch.setattr(backend, "BRIEFLY_S", 0.05)
-    status, body = answered("/readyz", ready(), Stuck())
+    status, body = front_answer("/readyz", ready_administrator(), Stuck())
     assert (status, json.loads(body)["code"]) == (503, "unavailable")
     healthy = health(1.0, 90.0, 1.0)
-    assert answered("/metrics", Administering(body=healthy.encode()), Stuck()) == (200, healthy)
+    assert front_answer("/metrics", Administering(body=healthy.encode()), Stuck()) == (200, healthy)
     fleet_front = Front.__new__(Front)
-    fleet_front._administrators, fleet_front._replicas = Administrators([ready(), Stuck()]), []
+    fleet_front._administrators, fleet_front._replicas = Administrators([ready_administrator(), Stuck()]), []
     last = {"type": "http.response.body", "body": b""}
     asyncio.run(asyncio.wait_for(fleet_front._before_last(last, fleet_front._administrators.backends[0]), 60.0))
 

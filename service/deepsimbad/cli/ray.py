@@ -50,7 +50,7 @@ def map_on_ray(
     Frames that were encoded are kept: after a kill the same command goes on.
     """
     _required()
-    from deepsimbad.fleet.drives import StoredDrive, encoded_elsewhere, joined, stored_drive  # noqa: PLC0415 - takes Ray
+    from deepsimbad.fleet.drives import StoredDrive, cluster_blocks, join_cluster, stored_drive  # noqa: PLC0415 - takes Ray
 
     settings = given_settings()
     folder = domain_folder(settings.data_dir, domain) / "encoding"
@@ -68,11 +68,11 @@ def map_on_ray(
     ) -> Iterable[EncodedBlock] | None:
         if recording.encodings is not None:
             return None
-        joined(address)
+        join_cluster(address)
         if isinstance(recording, FolderRecording) and recording.folder in copies:
             recording = copies[recording.folder].of(recording)
         given = (recording, measure, dict(evaluator.as_dict()), settings.compute(), settings.max_pixels)
-        return encoded_elsewhere(*given, folder, on_progress)
+        return cluster_blocks(*given, folder, on_progress)
 
     goes_on = "goes on where it stopped"
     context.invoke(map_, encode=encode, after_cancel=goes_on, domain=domain, evaluator=evaluator, **told)
@@ -120,10 +120,10 @@ def serve(
     settings = given_settings(host=host, port=port)
     _required()
     from deepsimbad.fleet import application  # noqa: PLC0415 - takes Ray
-    from deepsimbad.fleet.drives import joined  # noqa: PLC0415
+    from deepsimbad.fleet.drives import join_cluster  # noqa: PLC0415
 
     os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
-    joined(address)
+    join_cluster(address)
     of_networks = application.Encoders(encoders, encoder_gpus)
     fleet = application.build(settings, replicas, encoders=of_networks, n_administrators=administrators)
     front = application.start(fleet)

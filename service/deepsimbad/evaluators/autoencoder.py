@@ -116,7 +116,7 @@ def _errors(
 def _views(units: UnitLesson, queries: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.float32]:
     """[r, 16, k] views of every landmark's place: the frames and queries nearest to it, some more than once."""
     views = np.empty((len(units.landmarks), _SAMPLES, units.drive.shape[1]), np.float32)
-    query_m = units.position_m[units.true[queries]]
+    query_m = units.position_m[units.true_frames[queries]]
     for row, landmark_m in enumerate(units.position_m[units.landmarks].tolist()):
         frames = np.flatnonzero(np.abs(units.position_m - landmark_m) <= units.step_m)
         nearby = queries[np.abs(query_m - landmark_m) <= units.step_m]

@@ -86,9 +86,9 @@ class Fused(FeatureL2):
         weight, metrics = _EVEN, dict[str, Any]()
         if lesson.other is not None and len(lesson.places):
             rows = np.linspace(0, len(lesson.places) - 1, min(len(lesson.places), _MOST_ASKED)).astype(np.intp)
-            true, frames = lesson.places[rows].T
+            true_frames, frames = lesson.places[rows].T
             halves = self._half_dissimilarities(lesson.other[frames], encodings)
-            scores = {share: _anr(share * halves[0] + (1 - share) * halves[1], true) for share in _TRIED}
+            scores = {share: _anr(share * halves[0] + (1 - share) * halves[1], true_frames) for share in _TRIED}
             weight = float(min(scores, key=lambda share: scores[share]))
             metrics = {"weight": weight, "anr": {f"{share:.1f}": score for share, score in scores.items()}}
         return Fitted({**model, _WEIGHT: np.array([weight], np.float32)}, metrics)
@@ -130,9 +130,9 @@ class Fused(FeatureL2):
         return first, second
 
 
-def _anr(dissimilarities: NDArray[np.float32], true: NDArray[np.int64]) -> float:
-    """ANR in percent of queries' dissimilarities [n, m] to frames, of which `true` [n] and its neighbours are right."""
+def _anr(dissimilarities: NDArray[np.float32], true_frames: NDArray[np.int64]) -> float:
+    """ANR in percent of queries by dissimilarities [n, m] to frames; `true_frames` [n] and neighbours are right."""
     frames = np.arange(dissimilarities.shape[1])
-    near = np.abs(frames - true[:, np.newaxis]) <= _NEAR_FRAMES
+    near = np.abs(frames - true_frames[:, np.newaxis]) <= _NEAR_FRAMES
     best = np.where(near, dissimilarities, np.inf).min(axis=1, keepdims=True)
     return float(100 * ((dissimilarities < best) & ~near).sum(axis=1).mean() / dissimilarities.shape[1])

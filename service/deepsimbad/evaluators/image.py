@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from deepsimbad.errors import DeepSimbadError, InvalidImageError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
 from deepsimbad.evaluators.grey_levels import GreyLevels, in_eight_bits
-from deepsimbad.evaluators.image_files import JPEG, ImageFile, truncated
+from deepsimbad.evaluators.image_files import JPEG, ImageFile, raise_truncated
 
 KEPT_PIXELS = 3840 * 2160
 
@@ -148,7 +148,7 @@ def _of_jpeg(picture: bytes) -> Image | None:
     except ValueError as error:
         warning = str(error)
     if "premature end" in warning:
-        truncated()
+        raise_truncated()
     if warning.endswith("extraneous bytes before marker 0xd9") and (exact := _without_filling(picture)) != picture:
         return _of_jpeg(exact)
     return None

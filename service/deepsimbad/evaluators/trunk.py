@@ -44,7 +44,7 @@ class UnitLesson:
     drive: NDArray[np.float32]  # [m, k] the drive that landmarks were chosen from, by its own statistics
     landmarks: NDArray[np.int64]  # [r] the landmarks' rows in `drive`
     queries: NDArray[np.float32]  # [q, k] views whose place is known, as they would be seen live
-    true: NDArray[np.int64]  # [q] the row in `drive` that sees a query's place
+    true_frames: NDArray[np.int64]  # [q] the row in `drive` that sees a query's place
     weight: NDArray[np.float32]  # [q] of a query in the loss, so that augmented views do not outweigh a second season
     is_judge: NDArray[np.bool_]  # [q] views that alone tell how good a model is: another season's, or else relit ones
     has_second: bool  # whether another season is known
@@ -78,14 +78,14 @@ class Split:
     train: NDArray[np.int64]
     validation: NDArray[np.int64]  # choose the epoch
     test: NDArray[np.int64]  # judge the model
-    wrong: NDArray[np.int64]  # frames of `drive` outside the stretches of the test
+    wrong_frames: NDArray[np.int64]  # frames of `drive` outside the stretches of the test
 
     @classmethod
     def of(cls, units: UnitLesson, seed: int) -> Self:
         """Split a lesson by the stretches of route that its queries' places lie in."""
         rng, m = np.random.default_rng(seed), len(units.drive)
         block = np.arange(m) * _BLOCKS // m
-        of_query = block[units.true]
+        of_query = block[units.true_frames]
         validation, test = (
             np.sort(rng.permutation(np.flatnonzero(np.isin(of_query, blocks) & units.is_judge))[:_MOST_SCORED])
             for blocks in (_VALIDATION, _TEST)
@@ -105,17 +105,17 @@ class PairScores:
     @classmethod
     def of(cls, units: UnitLesson, rows: NDArray[np.int64], measure: Measure) -> Self:
         """Score a dissimilarity on queries `rows`; NaN where none of their places, or all, have a landmark."""
-        near = units.is_near(units.true[rows][:, np.newaxis], units.landmarks)
+        near = units.is_near(units.true_frames[rows][:, np.newaxis], units.landmarks)
         is_scored = near.any(axis=1) & ~near.all(axis=1)
         if not is_scored.any():
             return cls(float("nan"), float("nan"), np.empty(0))
         near, d = near[is_scored], measure(units.queries[rows[is_scored]])
         best = np.where(near, d, np.inf).min(axis=1, keepdims=True)
         n_before = ((d < best) & ~near).sum(axis=1) + 0.5 * ((d == best) & ~near).sum(axis=1)
-        far = np.sort(d[~near])
-        places = np.searchsorted(far, d[near], "left") + np.searchsorted(far, d[near], "right")
+        far_d = np.sort(d[~near])
+        n_smaller = np.searchsorted(far_d, d[near], "left") + np.searchsorted(far_d, d[near], "right")
         ranks = 100 * n_before / (~near).sum(axis=1)
-        return cls(float(ranks.mean()), 1 - float(places.mean()) / (2 * far.size), ranks)
+        return cls(float(ranks.mean()), 1 - float(n_smaller.mean()) / (2 * far_d.size), ranks)
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form; null where nothing was scored."""
@@ -213,27 +213,27 @@ class Trunk(OwnDissimilarities, FeatureL2):
         u = described(encodings, Moments.of(encodings), projection)
         position_m = np.arange(len(encodings), dtype=np.float64) if lesson.position_m is None else lesson.position_m
         step_m = float(np.median(np.abs(np.diff(position_m)))) + 1e-9
-        queries, true, weight, lit = [], [], [], []
+        queries, true_frames, weight, is_relit = [], [], [], []
         if lesson.other is not None and lesson.places.size:
             queries.append(described(lesson.other[lesson.places[:, 1]], moments, projection))
-            true.append(lesson.places[:, 0])
+            true_frames.append(lesson.places[:, 0])
             weight.append(np.ones(len(lesson.places), np.float32))
-            lit.append(np.zeros(len(lesson.places), np.bool_))
+            is_relit.append(np.zeros(len(lesson.places), np.bool_))
         if lesson.views is not None:
             r, a, d = lesson.views.shape
             queries.append(described(lesson.views.reshape(r * a, d), moments, projection))
-            true.append(np.repeat(lesson.landmarks, a))
+            true_frames.append(np.repeat(lesson.landmarks, a))
             weight.append(np.full(r * a, 1 / a, np.float32))
-            lit.append(np.tile(np.arange(a) >= a // 2, r))
+            is_relit.append(np.tile(np.arange(a) >= a // 2, r))
         if not queries:
             frames = np.arange(1, len(encodings))
             queries += [u[frames], u[frames - 1]]
-            true += [frames - 1, frames]
+            true_frames += [frames - 1, frames]
             weight += [np.ones(len(frames), np.float32)] * 2
-            lit += [np.ones(len(frames), np.bool_)] * 2
+            is_relit += [np.ones(len(frames), np.bool_)] * 2
         n_queries, n_second = sum(map(len, queries)), len(lesson.places) if lesson.other is not None else 0
-        is_judge = np.arange(n_queries) < n_second if n_second else np.concatenate(lit)
-        views = np.concatenate(queries), np.concatenate(true).astype(np.int64), np.concatenate(weight)
+        is_judge = np.arange(n_queries) < n_second if n_second else np.concatenate(is_relit)
+        views = np.concatenate(queries), np.concatenate(true_frames).astype(np.int64), np.concatenate(weight)
         return model, UnitLesson(u, lesson.landmarks, *views, is_judge, n_second > 0, position_m, step_m)
 
     def check_model(self, model: LandmarkModel, n_landmarks: int) -> None:

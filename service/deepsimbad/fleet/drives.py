@@ -38,7 +38,7 @@ _URL = re.compile(r"((?:s3|gs|az)://[^#]+?)/*(#.*)?")
 _AT_ONCE = 16  # requests for objects
 
 
-def encoded_elsewhere(
+def cluster_blocks(
     recording: Recording,
     evaluator: Evaluator,
     configuration: dict[str, Any],
@@ -163,7 +163,7 @@ def _last_line(error: Exception) -> str:
     return lines[-1].strip() if lines else type(error).__name__
 
 
-def joined(address: str | None) -> None:
+def join_cluster(address: str | None) -> None:
     """Join a cluster, or start one on this machine, unless this process is in one already."""
     if not ray.is_initialized():
         os.environ.setdefault("RAY_DATA_DISABLE_PROGRESS_BARS", "1")

@@ -36,7 +36,7 @@ class AskedOwners:
 
     async def gather(self, names: Sequence[str], is_all: bool) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
         mapped_domains, left_out = list[MappedDomain](), dict[str, DeepSimbadError]()
-        for asked_names, answer in await self._answers({name: name for name in names}, "gathered", is_all):
+        for asked_names, answer in await self._answers({name: name for name in names}, "gather_heads", is_all):
             if isinstance(answer, UnavailableError):
                 left_out |= dict.fromkeys(asked_names, answer)
             elif isinstance(answer, DeepSimbadError):

@@ -273,13 +273,13 @@ class Replica:
         return await asyncio.to_thread(store.listed_sessions, session_ids)
 
     async def answer(self, method: str, *arguments: Any) -> Any:
-        """The answer of `gathered` or `part`, or the error of ours that it raises."""
+        """The answer of `gather_heads` or `part`, or the error of ours that it raises."""
         try:
             return await getattr(self, method)(*arguments)
         except DeepSimbadError as error:
             return error.with_traceback(None)
 
-    async def gathered(
+    async def gather_heads(
         self, names: Sequence[str], is_all: bool
     ) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
         """As `Atlas.gather`, with each map's head in place of the map."""

@@ -42,7 +42,7 @@ def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
     """As the registry makes it, on the processor whatever else is wished; raises as `Evaluator.load`."""
     if not has_onnxruntime():
         raise MissingPackageError(f"onnx:{argument} needs ONNX Runtime: {INSTALL_FAST}")
-    path, sha256 = Lock.read(compute.weights_dir).pinned(argument)
+    path, sha256 = Lock.read(compute.weights_dir).pinned_file(argument)
     if path.stat().st_size > _MOST_BYTES:
         raise InvalidWeightsError(f"{argument} is larger than an ONNX file can be", file=argument)
     run = _FileRun(argument, path.read_bytes(), compute)

@@ -44,7 +44,7 @@ def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
     """As the registry makes it; a file in the weights' folder; raises as `Evaluator.load`."""
     if not has_torch():
         raise MissingPackageError(f"squeezenet needs PyTorch: {INSTALL_TORCH}")
-    path, sha256 = Lock.read(compute.weights_dir).pinned(file)
+    path, sha256 = Lock.read(compute.weights_dir).pinned_file(file)
     # Only the kind of the file is looked at here; whether it is whole shows when it is read
     size = ((CAFFE if _is_npz(path) else TORCHVISION).side,) * 2
     run = make_run(lambda: _module(path), compute, size, f"squeezenet-{_RECIPE}-{sha256[:16]}")

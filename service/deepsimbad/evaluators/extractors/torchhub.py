@@ -202,7 +202,7 @@ class _Watch:
 
     may_ask: bool
     opened_files: set[str] = field(default_factory=set)
-    refused: list[str] = field(default_factory=list)
+    refused_addresses: list[str] = field(default_factory=list)
 
     def see(self, event: str, arguments: tuple[Any, ...]) -> None:
         """Take an audit event of this thread."""
@@ -216,7 +216,7 @@ class _Watch:
     def refuse(self, address: str) -> None:
         """Let a request fail as it does without a network."""
         if _BRANCH_QUESTION.fullmatch(address) is None:
-            self.refused.append(address)
+            self.refused_addresses.append(address)
         raise URLError(f"{address} is not asked: models are loaded from the weights' folder alone")
 
     def companions(self, hub: Path, tree: Path) -> list[str]:
@@ -312,11 +312,11 @@ def _named_failures(
         text = f"{type(error).__name__}: {error}"
         if is_lack_of_memory(error):
             raise OutOfMemoryError(f"there is too little memory for {extractor}") from error
-        if watch is not None and watch.refused:
+        if watch is not None and watch.refused_addresses:
             raise MissingWeightsError(
-                f"{extractor} wants {watch.refused[-1]}, and nothing is downloaded while it is loaded: pull it again, "
-                f"`deepsimbad weights pull {extractor}`",
-                extractor=extractor, url=watch.refused[-1],
+                f"{extractor} wants {watch.refused_addresses[-1]}, and nothing is downloaded while it is loaded: "
+                f"pull it again, `deepsimbad weights pull {extractor}`",
+                extractor=extractor, url=watch.refused_addresses[-1],
             ) from error  # fmt: skip
         package = _missing_package(error, tree)
         if package is not None:

@@ -27,7 +27,7 @@ class SentenceBert:
             from safetensors.torch import load_file
             from tokenizers import Tokenizer
         except ImportError as error:
-            raise missing(error) from error
+            raise missing_package(error) from error
         try:
             self._config = _read_json(folder / "config.json")
             pooling = folder / "1_Pooling" / "config.json"
@@ -103,6 +103,6 @@ def _read_json(file: Path) -> dict[str, Any]:
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
-def missing(error: ImportError) -> MissingPackageError:
+def missing_package(error: ImportError) -> MissingPackageError:
     """The error to raise where a package of language cannot be imported."""
     return MissingPackageError(f"a package that language needs cannot be imported: {error}: {INSTALL}")

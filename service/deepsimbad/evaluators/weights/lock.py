@@ -159,7 +159,7 @@ class Lock:
         Path(new.name).chmod(0o644)  # a folder of weights may be shared
         Path(new.name).replace(self.folder / LOCK)
 
-    def pinned(self, name: str) -> tuple[Path, str]:
+    def pinned_file(self, name: str) -> tuple[Path, str]:
         """A file of the folder and its SHA-256, which is as recorded where it was pulled.
 
         Raises:
@@ -198,7 +198,7 @@ def tree_sha256(folder: Path) -> str:
     """One digest of all files in a folder: their paths and contents, in the order of their paths."""
     tree = hashlib.sha256()
     for path in sorted(folder.rglob("*"), key=lambda file: file.relative_to(folder).as_posix()):
-        inside = path.relative_to(folder)
-        if path.is_file() and _NOT_CONTENT not in inside.parts:
-            tree.update(f"{file_sha256(path)}  {inside.as_posix()}\n".encode())
+        relative_path = path.relative_to(folder)
+        if path.is_file() and _NOT_CONTENT not in relative_path.parts:
+            tree.update(f"{file_sha256(path)}  {relative_path.as_posix()}\n".encode())
     return tree.hexdigest()
