@@ -75,7 +75,7 @@ def pictures(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def mapped(deepsimbad, drives, tmp_path) -> Path:
+def mapped_dir(deepsimbad, drives, tmp_path) -> Path:
     """A data directory with one mapped domain, `route`."""
     sources = ("--landmarks", drives / "landmarks.npy", "--training", drives / "summer.npy")
     ran = deepsimbad("map", "route", *sources, "--evaluator", "feature_l2:none", "--n-landmarks", 20)

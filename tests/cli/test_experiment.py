@@ -48,21 +48,21 @@ def route(tmp_path_factory):
 
 
 @pytest.fixture
-def measured(deepsimbad):
+def measure(deepsimbad):
     """The one JSON document of an experiment."""
 
     def run(*arguments):
         ran = deepsimbad("experiment", *arguments, "--json")
         document = json.loads(ran.out, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
-        told = "".join(f"warning: {warning}\n" for warning in document["warnings"])
-        assert (ran.code, ran.err) == (0, told)
+        expected = "".join(f"warning: {warning}\n" for warning in document["warnings"])
+        assert (ran.code, ran.err) == (0, expected)
         return document
 
     return run
 
 
-def test_vpr_is_one_document_with_the_stable_keys(measured, triplet):
-    document = measured("vpr", *triplet, *READY)
+def test_vpr_is_one_document_with_the_stable_keys(measure, triplet):
+    document = measure("vpr", *triplet, *READY)
     assert set(document) == KEYS
     assert set(document["anr"]) == set(document["recall_at_1"]) == set(document["recall_at_5"]) == SEVEN
     assert all(0 <= anr < 20 for anr in document["anr"].values()), document["anr"]
@@ -73,32 +73,32 @@ def test_vpr_is_one_document_with_the_stable_keys(measured, triplet):
     assert all(seconds >= 0 for seconds in document["seconds"].values())
 
 
-def test_vpr_drives_in_order_unless_every_view_is_by_itself(measured, deepsimbad, triplet):
-    passive = measured("vpr", *triplet, *READY, "--relevance", "composed")["passive"]
+def test_vpr_drives_in_order_unless_every_view_is_by_itself(measure, deepsimbad, triplet):
+    passive = measure("vpr", *triplet, *READY, "--relevance", "composed")["passive"]
     sums = {"filter", "sum", "sum_any_speed", "sum_brute_force_u"}
     for of in ("anr", "recall_at_1"):
         assert set(passive[of]) == sums
-        assert all(set(each) == {"1", "2", "5", "10", "20"} for each in passive[of].values())
+        assert all(set(by_window) == {"1", "2", "5", "10", "20"} for by_window in passive[of].values())
     assert passive["n_queries"] == {"1": 80, "2": 79, "5": 76, "10": 71, "20": 61}
     assert passive["whole_drive"]["recall_at_1"] > 95
-    shown = deepsimbad("experiment", "vpr", *triplet, *READY, "--relevance", "composed").out
-    (row,) = [line for line in shown.splitlines() if " sum_any_speed " in line]
+    output = deepsimbad("experiment", "vpr", *triplet, *READY, "--relevance", "composed").out
+    (row,) = [line for line in output.splitlines() if " sum_any_speed " in line]
     assert f"{passive['anr']['sum_any_speed']['5']:.2f} / {passive['recall_at_1']['sum_any_speed']['5']:.1f}" in row
-    for more in (("--stateless", "--relevance", "composed"), ("--relevance", "rrf")):
-        assert measured("vpr", *triplet, *READY, *more)["passive"] is None
+    for options in (("--stateless", "--relevance", "composed"), ("--relevance", "rrf")):
+        assert measure("vpr", *triplet, *READY, *options)["passive"] is None
 
 
-def test_how_much_lists_owe_to_their_own_places_landmarks(measured, deepsimbad, route):
-    asked = (*route, *READY[:2], "--n-landmarks", 60, "--relevance", "composed")
-    usual, barred = measured("vpr", *asked), measured("vpr", *asked, "--bar-own-place")
-    assert set(barred["anr"]) == {"composed", "brute_force_u"}
-    assert barred["anr"]["composed"] > usual["anr"]["composed"]
-    assert barred["recall_at_1"]["brute_force_u"] == usual["recall_at_1"]["brute_force_u"]
+def test_how_much_lists_owe_to_their_own_places_landmarks(measure, deepsimbad, route):
+    arguments = (*route, *READY[:2], "--n-landmarks", 60, "--relevance", "composed")
+    document, barred_document = measure("vpr", *arguments), measure("vpr", *arguments, "--bar-own-place")
+    assert set(barred_document["anr"]) == {"composed", "brute_force_u"}
+    assert barred_document["anr"]["composed"] > document["anr"]["composed"]
+    assert barred_document["recall_at_1"]["brute_force_u"] == document["recall_at_1"]["brute_force_u"]
     assert deepsimbad("experiment", "vpr", *route, *READY, "--relevance", "rrf", "--bar-own-place").code == 2
 
 
-def test_nbv_is_one_document_with_the_stable_keys(measured, route):
-    document = measured("nbv", *route, *QUICK)
+def test_nbv_is_one_document_with_the_stable_keys(measure, route):
+    document = measure("nbv", *route, *QUICK)
     assert set(document) >= {"anr", "default", "anr_paper", "interval_95", "config"}
     assert set(document["anr"]) == set(document["anr_paper"]) == set(document["interval_95"]) == PLANNERS
     assert document["default"] == "informed"
@@ -115,8 +115,8 @@ def test_nbv_is_one_document_with_the_stable_keys(measured, route):
 
 @pytest.mark.parametrize("kind", ["vpr", "nbv"])
 def test_json_into_a_file_leaves_the_table_to_people(deepsimbad, triplet, route, tmp_path, kind):
-    given = (*triplet, *READY) if kind == "vpr" else (*route, *QUICK)
-    ran = deepsimbad("experiment", kind, *given, "--json", tmp_path / "out.json")
+    arguments = (*triplet, *READY) if kind == "vpr" else (*route, *QUICK)
+    ran = deepsimbad("experiment", kind, *arguments, "--json", tmp_path / "out.json")
     assert (ran.code, ran.err) == (0, "")
     for name, anr in json.loads((tmp_path / "out.json").read_text())["anr"].items():
         (row,) = [line for line in ran.out.splitlines() if f" {name} " in line and "paired" not in line]
@@ -124,52 +124,52 @@ def test_json_into_a_file_leaves_the_table_to_people(deepsimbad, triplet, route,
     assert ("80 queries scored" if kind == "vpr" else "informed (default)") in ran.out
 
 
-def test_every_option_of_vpr_is_heeded(measured, triplet, drives):
+def test_every_option_of_vpr_is_heeded(measure, triplet, drives):
     only = ("--relevance", "rrf", "--relevance", "simbad")
-    usual = measured("vpr", *triplet, *READY, *only)
-    assert set(usual["anr"]) == {"rrf", "simbad"}
-    assert measured("vpr", *triplet, *READY, *only, "--tolerance", 9)["anr"]["rrf"] < usual["anr"]["rrf"]
-    long = measured("vpr", *triplet, *READY, *only, "--list-length", 12)
+    document = measure("vpr", *triplet, *READY, *only)
+    assert set(document["anr"]) == {"rrf", "simbad"}
+    assert measure("vpr", *triplet, *READY, *only, "--tolerance", 9)["anr"]["rrf"] < document["anr"]["rrf"]
+    long = measure("vpr", *triplet, *READY, *only, "--list-length", 12)
     assert long["config"]["list_length"] == 12
-    assert long["anr"]["rrf"] != usual["anr"]["rrf"]
-    far = measured("vpr", *triplet, *READY, *only, "--spacing-m", 3)
-    assert far["anr"]["rrf"] > usual["anr"]["rrf"], "three metres apart, the neighbours are no longer right"
+    assert long["anr"]["rrf"] != document["anr"]["rrf"]
+    far = measure("vpr", *triplet, *READY, *only, "--spacing-m", 3)
+    assert far["anr"]["rrf"] > document["anr"]["rrf"], "three metres apart, the neighbours are no longer right"
     sliced = ("--training", f"{drives / 'summer.npy'}#0:40", "--test", f"{drives / 'winter.npy'}#30:60:2")
-    part = measured("vpr", *triplet[:2], *sliced, *READY, *only)
+    part = measure("vpr", *triplet[:2], *sliced, *READY, *only)
     assert (part["n_queries"], part["n_left_out"]) == (6, 9), "30..40 lie within 2 m of the map, 42..58 do not"
-    elsewhere = ("--training", f"{drives / 'summer.npy'}#:20", "--test", f"{drives / 'winter.npy'}#60:")
-    none = measured("vpr", *triplet[:2], *elsewhere, *READY, *only)
+    sources = ("--training", f"{drives / 'summer.npy'}#:20", "--test", f"{drives / 'winter.npy'}#60:")
+    none = measure("vpr", *triplet[:2], *sources, *READY, *only)
     assert (none["n_queries"], set(none["anr"].values())) == (0, {None}), "a number that JSON lacks becomes null"
 
 
-def test_every_option_of_nbv_is_heeded(measured, route):
+def test_every_option_of_nbv_is_heeded(measure, route):
     options = ("--relevance", "rrf", "--seed", 7, "--list-length", 3, "--spacing-m", 2)
-    document = measured("nbv", *route, *QUICK, *options)
+    document = measure("nbv", *route, *QUICK, *options)
     config = document["config"]
     assert (config["relevance"], config["update"]) == ("rrf", "additive_relevance"), "an update that suits it"
     assert (config["seed"], config["list_length"], config["spacing_m"]) == (7, 3, 2.0)
-    other = measured("nbv", *route, *QUICK, *options, "--update", "additive_reciprocal_rank")
+    other = measure("nbv", *route, *QUICK, *options, "--update", "additive_reciprocal_rank")
     assert other["config"]["update"] == "additive_reciprocal_rank"
     assert other["anr"]["constant_1"] != document["anr"]["constant_1"]
     assert other["anr_paper"]["constant_1"] == document["anr_paper"]["constant_1"], "the paper's is always the paper's"
 
 
-def test_ground_truth_replaces_the_tolerance(measured, triplet, tmp_path):
+def test_ground_truth_replaces_the_tolerance(measure, triplet, tmp_path):
     np.save(tmp_path / "truth.npy", np.array([[(place + 40) % 80] if place else [-1] for place in range(80)]))
-    document = measured("vpr", *triplet, *READY, "--ground-truth", tmp_path / "truth.npy")
+    document = measure("vpr", *triplet, *READY, "--ground-truth", tmp_path / "truth.npy")
     assert (document["n_queries"], document["n_left_out"]) == (79, 1)
     assert document["anr"]["brute_force"] > 30, "half a route away is about chance"
     assert document["config"]["ground_truth"] == str(tmp_path / "truth.npy")
 
 
-def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(measured, drives, tmp_path):
+def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(measure, drives, tmp_path):
     """Positions count as comparable unless something else is said, or other truths are given."""
     np.save(tmp_path / "truth.npy", np.arange(80)[:, np.newaxis])
     truth = ("--ground-truth", tmp_path / "truth.npy")
 
     def season(landmarks, *options):
         triplet = ("--landmarks", drives / f"{landmarks}.npy", *triplet_of(drives, "summer")[2:])
-        return measured("vpr", *triplet, *READY, "--relevance", "composed", *options)["second_season"]
+        return measure("vpr", *triplet, *READY, "--relevance", "composed", *options)["second_season"]
 
     assert season("winter")["accepted"]
     assert not season("landmarks")["accepted"]
@@ -178,13 +178,13 @@ def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(measured, 
     assert season("winter", *truth, "--same-route")["accepted"]
 
 
-def test_frames_left_out_are_told(measured, pictures, tmp_path):
+def test_frames_left_out_are_told(measure, pictures, tmp_path):
     copy = tmp_path / "pictures"
     copy.mkdir()
     for file in pictures.iterdir():
         (copy / file.name).write_bytes(b"broken" if file.name == "4.png" else file.read_bytes())
     triplet = ("--landmarks", pictures, "--training", copy, "--test", pictures)
-    document = measured("vpr", *triplet, "--n-landmarks", 20)
+    document = measure("vpr", *triplet, "--n-landmarks", 20)
     left_out = document["config"]["left_out"]
     assert left_out["landmarks"] == left_out["test"] == {}
     assert list(left_out["training"].values()) == [1]
@@ -192,19 +192,21 @@ def test_frames_left_out_are_told(measured, pictures, tmp_path):
     assert (document["n_queries"], document["n_left_out"]) == (29, 1)
 
 
-def test_as_many_landmarks_are_taken_as_fit_and_the_number_is_told(deepsimbad, measured, triplet):
+def test_as_many_landmarks_are_taken_as_fit_and_the_number_is_told(deepsimbad, measure, triplet):
     by_itself = ("--evaluator", "feature_l2:none", "--relevance", "rrf")
-    assert measured("vpr", *triplet, *by_itself)["config"]["n_landmarks"] == 60, "every frame of the landmark drive"
+    assert measure("vpr", *triplet, *by_itself)["config"]["n_landmarks"] == 60, "every frame of the landmark drive"
     assert "60 landmarks" in deepsimbad("experiment", "vpr", *triplet, *by_itself).out
 
 
-def test_a_test_drive_that_was_learnt_from_is_warned_of_whatever_it_is_called(measured, drives, tmp_path):
+def test_a_test_drive_that_was_learnt_from_is_warned_of_whatever_it_is_called(measure, drives, tmp_path):
     np.save(tmp_path / "copy.npy", np.load(drives / "winter.npy"))
 
     def ran(landmarks, training):
         sources = ("--landmarks", landmarks, "--training", training, "--test", drives / "winter.npy")
-        document = measured("vpr", *sources, *READY, "--relevance", "composed")
-        return [re.findall(r"^test_drive_known: .* the (\w+) drive", each) for each in document["warnings"]], document
+        document = measure("vpr", *sources, *READY, "--relevance", "composed")
+        return [
+            re.findall(r"^test_drive_known: .* the (\w+) drive", warning) for warning in document["warnings"]
+        ], document
 
     assert ran(drives / "landmarks.npy", drives / "summer.npy")[0] == []
     assert ran("copy.npy", drives / "summer.npy")[0] == [["landmarks"]]
@@ -216,21 +218,21 @@ def test_a_test_drive_that_was_learnt_from_is_warned_of_whatever_it_is_called(me
 
 def test_named_errors(deepsimbad, triplet, route, tmp_path):
     short = [*route[:-1], f"{route[-1]}#:90"]
-    for kind, sources, more in (
-        *(("vpr", (*triplet, *READY), more) for more in (("--n-landmarks", 99), ("--list-length", 41))),
+    for kind, sources, options in (
+        *(("vpr", (*triplet, *READY), options) for options in (("--n-landmarks", 99), ("--list-length", 41))),
         ("vpr", (*triplet, *READY), ("--ground-truth", tmp_path / "nowhere.npy")),
         ("nbv", (*short, *QUICK), ()),
-        *(("nbv", (*route, *QUICK), more) for more in (("--n-landmarks", 131), ("--list-length", 41))),
+        *(("nbv", (*route, *QUICK), options) for options in (("--n-landmarks", 131), ("--list-length", 41))),
     ):
-        ran = deepsimbad("experiment", kind, *sources, *more)
+        ran = deepsimbad("experiment", kind, *sources, *options)
         assert (ran.code, ran.out, len(ran.err.splitlines())) == (1, "", 1), ran.err
-    for more in (("--episodes", 1), ("--seed", -1), ("--update", "none"), ("--relevance", "none")):
-        assert deepsimbad("experiment", "nbv", *route, *QUICK, *more).code == 2
+    for options in (("--episodes", 1), ("--seed", -1), ("--update", "none"), ("--relevance", "none")):
+        assert deepsimbad("experiment", "nbv", *route, *QUICK, *options).code == 2
 
 
 def test_an_experiment_makes_no_data_directory(deepsimbad, tmp_path):
-    given = ("--landmarks", "a.npy", "--training", "b.npy", "--test", "c.npy", "--data-dir", "some")
-    ran = deepsimbad("experiment", "vpr", *given)
+    arguments = ("--landmarks", "a.npy", "--training", "b.npy", "--test", "c.npy", "--data-dir", "some")
+    ran = deepsimbad("experiment", "vpr", *arguments)
     assert ran.code == 1
     assert "a.npy" in ran.err
     assert not (tmp_path / "some").exists()
@@ -260,19 +262,19 @@ def test_a_known_set_is_scored_as_its_papers_do_unless_told(deepsimbad, pictures
         for place in range(12):
             shutil.copy(pictures / f"{place}.png", tmp_path / drive / f"Image{place:03d}.png")
     left, right = (f"gardens_point:{tmp_path}/{drive}" for drive in ("day_left", "day_right"))
-    asked = ("experiment", "vpr", "--landmarks", left, "--training", left, "--test", right, "--relevance", "rrf")
-    asked = (*asked, "--evaluator", "feature_l2:gradient_grid", "--n-landmarks", 8)
-    ran = deepsimbad(*asked)
+    arguments = ("experiment", "vpr", "--landmarks", left, "--training", left, "--test", right, "--relevance", "rrf")
+    arguments = (*arguments, "--evaluator", "feature_l2:gradient_grid", "--n-landmarks", 8)
+    ran = deepsimbad(*arguments)
     assert ran.code == 0, ran.err
     assert "true within 2.5 m" in ran.out
     assert "R@10" in ran.out
     assert "test: Gardens Point: 12 frames, true within 2 frames unless --tolerance says otherwise" in ran.err
-    assert json.loads(deepsimbad(*asked, "--tolerance", 0, "--json").out)["config"]["tolerance_m"] == 0
+    assert json.loads(deepsimbad(*arguments, "--tolerance", 0, "--json").out)["config"]["tolerance_m"] == 0
 
 
-def test_an_evaluator_that_is_fitted_tells_how(measured, route):
+def test_an_evaluator_that_is_fitted_tells_how(measure, route):
     only = ("--relevance", "rrf", "--relevance", "composed")
-    document = measured("vpr", *route, "--evaluator", "autoencoder:none", "--n-landmarks", 40, *only)
+    document = measure("vpr", *route, "--evaluator", "autoencoder:none", "--n-landmarks", 40, *only)
     assert document["config"]["evaluator"] == {"kind": "autoencoder", "extractor": "none"}
     assert document["fitting"]["n_shared_places"] == 130
     assert set(document["fitting"]["held_out"]) == {"autoencoder", "l2"}

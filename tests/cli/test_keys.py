@@ -13,22 +13,22 @@ KEY = re.compile(r"dsk_([0-9a-f]{12})_[A-Za-z0-9_-]{43}")
 def test_a_key_is_printed_alone(deepsimbad, tmp_path):
     ran = deepsimbad("keys", "create", "--scope", "admin", "--name", "the operator", "--data-dir", tmp_path / "d")
     assert ran.code == 0
-    found = KEY.fullmatch(ran.out.rstrip("\n"))
-    assert found
+    match = KEY.fullmatch(ran.out.rstrip("\n"))
+    assert match
     assert ran.out.count("\n") == 1
     assert "first" in ran.err
     assert ran.out.strip() not in ran.err
     limits = ("--expires-days", "2", "--domain", "campus", "--domain", "yard")
     second = deepsimbad("keys", "create", "--scope", "localize", *limits, "--data-dir", tmp_path / "d")
     assert "first" not in second.err
-    listed = json.loads(deepsimbad("keys", "list", "--json", "--data-dir", tmp_path / "d").out)
-    assert [(key["key_id"], key["name"], key["scope"], key["state"]) for key in listed] == [
-        (found[1], "the operator", "admin", "usable"),
+    keys = json.loads(deepsimbad("keys", "list", "--json", "--data-dir", tmp_path / "d").out)
+    assert [(key["key_id"], key["name"], key["scope"], key["state"]) for key in keys] == [
+        (match[1], "the operator", "admin", "usable"),
         (KEY.fullmatch(second.out.strip())[1], "", "localize", "usable"),
     ]
-    assert [key["domains"] for key in listed] == [None, ["campus", "yard"]]
-    assert listed[0]["expires_at"] is None
-    assert listed[1]["expires_at"] > listed[1]["created_at"]
+    assert [key["domains"] for key in keys] == [None, ["campus", "yard"]]
+    assert keys[0]["expires_at"] is None
+    assert keys[1]["expires_at"] > keys[1]["created_at"]
 
 
 def test_a_revoked_key_is_listed_as_such(deepsimbad):
@@ -41,8 +41,8 @@ def test_a_revoked_key_is_listed_as_such(deepsimbad):
     assert ran.code == 0, "a whole key names itself"
     assert "stays closed" in ran.err
     assert second[0] not in ran.err
-    listed = json.loads(deepsimbad("keys", "list", "--json").out)
-    assert [key["state"] for key in listed] == ["revoked", "revoked"]
+    keys = json.loads(deepsimbad("keys", "list", "--json").out)
+    assert [key["state"] for key in keys] == ["revoked", "revoked"]
     table = deepsimbad("keys", "list").out
     assert first[1] in table
     assert "[red]x" in table
@@ -53,10 +53,10 @@ def test_a_script_is_told_what_was_revoked(deepsimbad):
     key = KEY.fullmatch(deepsimbad("keys", "create", "--scope", "admin", "--name", "old").out.strip())
     ran = deepsimbad("keys", "revoke", key[1], "--json")
     assert ran.code == 0
-    told = json.loads(ran.out)
-    assert (told["key_id"], told["name"], told["state"]) == (key[1], "old", "revoked")
-    assert told["revoked_at"]
-    assert [told] == json.loads(deepsimbad("keys", "list", "--json").out)
+    document = json.loads(ran.out)
+    assert (document["key_id"], document["name"], document["state"]) == (key[1], "old", "revoked")
+    assert document["revoked_at"]
+    assert [document] == json.loads(deepsimbad("keys", "list", "--json").out)
     assert "stays closed" in ran.err
 
 
@@ -91,5 +91,5 @@ def test_a_key_that_nobody_could_read_opens_nothing(deepsimbad, tmp_path):
         ran = subprocess.run(full, check=False, shell=True, cwd=tmp_path, capture_output=True, text=True)
         assert ran.returncode == 1
         assert says in ran.stderr
-    listed = json.loads(deepsimbad("keys", "list", "--json").out)
-    assert [key["state"] for key in listed] == ["revoked"]
+    keys = json.loads(deepsimbad("keys", "list", "--json").out)
+    assert [key["state"] for key in keys] == ["revoked"]

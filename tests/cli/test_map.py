@@ -54,9 +54,9 @@ def test_a_map_is_made_and_described(deepsimbad, drives, tmp_path):
     second = json.loads(ran.out)
     assert (second["domain"], second["map_version"], second["active"]) == ("route", 2, True)
     assert second["metrics"]["n_map_images"] == 15
-    made = contents(tmp_path / "here", 2)
-    assert made.position_m.tolist() == list(range(10, 40, 2)), "a slice keeps its frames' positions"
-    assert made.n_landmarks == 60, "landmarks default to every frame of a short recording"
+    map_ = contents(tmp_path / "here", 2)
+    assert map_.position_m.tolist() == list(range(10, 40, 2)), "a slice keeps its frames' positions"
+    assert map_.n_landmarks == 60, "landmarks default to every frame of a short recording"
 
 
 def test_pictures_are_kept_where_the_domain_says_so_and_go_into_backups(deepsimbad, tmp_path):
@@ -82,11 +82,11 @@ def test_pictures_are_kept_where_the_domain_says_so_and_go_into_backups(deepsimb
         landmarks = [("one", map_.landmark_digest, number, name) for number, name in enumerate(map_.landmark_frame)]
         assert (len(images), len(landmarks)) == (6, 4)
         for of_drive, digests, number, name in images + landmarks:
-            seen = Pictures(tmp_path / "there", 1 << 24).of_frame(map_, digests, number)
-            whole = cv2.imread(str(tmp_path / of_drive / name))
-            shown = cv2.imdecode(np.frombuffer(seen, np.uint8), cv2.IMREAD_COLOR)
-            assert shown.shape == (96, 128, 3)
-            assert np.abs(cv2.resize(whole, (128, 96)).astype(int) - shown).mean() < 12
+            thumbnail = Pictures(tmp_path / "there", 1 << 24).of_frame(map_, digests, number)
+            image = cv2.imread(str(tmp_path / of_drive / name))
+            small_image = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
+            assert small_image.shape == (96, 128, 3)
+            assert np.abs(cv2.resize(image, (128, 96)).astype(int) - small_image).mean() < 12
 
 
 def test_pictures_under_a_lens_cap_are_counted(deepsimbad, pictures, tmp_path):
@@ -101,38 +101,38 @@ def test_pictures_under_a_lens_cap_are_counted(deepsimbad, pictures, tmp_path):
 
 def test_every_option_of_a_map_is_heeded(deepsimbad, drives, tmp_path):
     options = ("--n-landmarks", 12, "--list-length", 3, "--relevance", "rrf", "--training-episodes", 7, "--seed", 5)
-    given = (*options, "--spacing-m", 2.5, "--closed", "--actions-m", "-2.5,0,5", "--data-dir", "here")
-    ran = deepsimbad("map", "route", *sources(drives), *READY, *given)
+    arguments = (*options, "--spacing-m", 2.5, "--closed", "--actions-m", "-2.5,0,5", "--data-dir", "here")
+    ran = deepsimbad("map", "route", *sources(drives), *READY, *arguments)
     assert ran.code == 0, ran.err
-    made = contents(tmp_path / "here")
-    assert made.lists.shape == (3, 80)
-    assert made.landmark_model["prototypes"].shape == (12, 16)
-    assert (made.closed, made.actions_m.tolist()) == (True, [-2.5, 0, 5])
-    assert made.position_m.tolist() == (2.5 * np.arange(80)).tolist()
-    assert made.statistics is None
+    map_ = contents(tmp_path / "here")
+    assert map_.lists.shape == (3, 80)
+    assert map_.landmark_model["prototypes"].shape == (12, 16)
+    assert (map_.closed, map_.actions_m.tolist()) == (True, [-2.5, 0, 5])
+    assert map_.position_m.tolist() == (2.5 * np.arange(80)).tolist()
+    assert map_.statistics is None
     expected = {"n_landmarks": 12, "list_length": 3, "relevance": "rrf", "training_episodes": 7, "seed": 5}
-    assert {name: made.config[name] for name in expected} == expected
+    assert {name: map_.config[name] for name in expected} == expected
 
 
 def test_two_seasons_are_learnt_from_where_the_route_is_said_to_be_one(deepsimbad, drives):
     """Of drives without x, y; and where their views differ, or too few are of the same places, people are told."""
 
-    def made(landmarks, *said, part=""):
+    def make(landmarks, *options, part=""):
         pair = ("--landmarks", drives / f"{landmarks}.npy", "--training", f"{drives / 'summer.npy'}{part}")
-        ran = deepsimbad("map", landmarks, *pair, *READY, "--n-landmarks", 40, "--training-episodes", 0, *said)
+        ran = deepsimbad("map", landmarks, *pair, *READY, "--n-landmarks", 40, "--training-episodes", 0, *options)
         assert ran.code == 0, ran.err
         return ran
 
-    same = [
-        json.loads(made("winter", *said, "--json").out)["metrics"]["second_season"]
-        for said in ((), ("--same-route",), ("--no-same-route",))
+    verdicts = [
+        json.loads(make("winter", *options, "--json").out)["metrics"]["second_season"]
+        for options in ((), ("--same-route",), ("--no-same-route",))
     ]
-    assert [season["accepted"] for season in same] == [False, True, False]
-    assert made("winter", "--same-route").err == made("landmarks").err == ""
-    assert "it learnt nothing of a second season: at equal positions" in made("landmarks", "--same-route").err
-    few = made("winter", "--same-route", part="#:29").err
-    assert "it learnt nothing of a second season: the two drives share 29 places by their positions" in few
-    assert "second season" not in made("winter", part="#:29").err
+    assert [season["accepted"] for season in verdicts] == [False, True, False]
+    assert make("winter", "--same-route").err == make("landmarks").err == ""
+    assert "it learnt nothing of a second season: at equal positions" in make("landmarks", "--same-route").err
+    errors = make("winter", "--same-route", part="#:29").err
+    assert "it learnt nothing of a second season: the two drives share 29 places by their positions" in errors
+    assert "second season" not in make("winter", part="#:29").err
 
 
 def test_the_data_directory_comes_from_the_flag_the_environment_or_here(deepsimbad, drives, tmp_path, monkeypatch):
@@ -263,12 +263,12 @@ def test_encodings_and_what_is_told_are_localized_too(deepsimbad, drives, pictur
     assert [answer["retrieval"][0]["map_image"] for answer in answers] == [3, 4]
     named_error(deepsimbad("localize", "ready", pictures / "1.png"), "1.png: ", "ready encodings alone")
     drive = shutil.copytree(pictures, tmp_path / "told")
-    seen = [{"objects": [{"label": f"sign {at}", "box": [0.1, 0.1, 0.3, 0.2 + at / 50]}]} for at in range(30)]
-    lines = [json.dumps({"name": f"{at}.png", **told}) for at, told in enumerate(seen)]
+    scenes = [{"objects": [{"label": f"sign {at}", "box": [0.1, 0.1, 0.3, 0.2 + at / 50]}]} for at in range(30)]
+    lines = [json.dumps({"name": f"{at}.png", **scene}) for at, scene in enumerate(scenes)]
     (drive / "detections.jsonl").write_text("\n".join(lines))
     ran = deepsimbad("map", "told", "--training", drive, "--evaluator", "objects", "--training-episodes", 0)
     assert ran.code == 0, ran.err
-    (tmp_path / "view.json").write_text(json.dumps(seen[7]))
+    (tmp_path / "view.json").write_text(json.dumps(scenes[7]))
     views = ("localize", "told", tmp_path / "view.json", drive / "9.png", f"{drive}#11:12")
     answers = json.loads(deepsimbad(*views, "--json").out)
     assert [answer["retrieval"][0]["map_image"] for answer in answers] == [7, 9, 11]
@@ -352,9 +352,9 @@ def test_ctrl_c_cancels_a_map_and_leaves_no_half_of_one(process, tmp_path):
 
 
 def test_a_domain_is_deleted_when_that_is_confirmed(deepsimbad, drives, tmp_path):
-    here = ("--data-dir", tmp_path / "here")
-    deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, *here)
-    ran = deepsimbad("delete-domain", "route", "--yes", *here)
+    data_dir = ("--data-dir", tmp_path / "here")
+    deepsimbad("map", "route", *sources(drives), *READY, "--n-landmarks", 20, *data_dir)
+    ran = deepsimbad("delete-domain", "route", "--yes", *data_dir)
     assert (ran.code, ran.out) == (0, "domain route is deleted\n")
-    assert deepsimbad("info", "route", *here).code == 1
-    assert deepsimbad("delete-domain", "route", "--yes", *here).code == 1
+    assert deepsimbad("info", "route", *data_dir).code == 1
+    assert deepsimbad("delete-domain", "route", "--yes", *data_dir).code == 1

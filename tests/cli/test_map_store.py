@@ -10,12 +10,12 @@ def document(ran):
     return json.loads(ran.out)
 
 
-def test_two_data_directories_share_their_maps(deepsimbad, mapped, tmp_path):
+def test_two_data_directories_share_their_maps(deepsimbad, mapped_dir, tmp_path):
     store = f"file://{tmp_path}/store"
     assert deepsimbad("init", "--map-store", store).code == 0
     assert deepsimbad("init", *THERE, "--map-store", store).code == 0
-    before = document(deepsimbad("info", "route", "--json"))
-    assert document(deepsimbad("info", "route", "--json", *THERE)) == before
+    description = document(deepsimbad("info", "route", "--json"))
+    assert document(deepsimbad("info", "route", "--json", *THERE)) == description
     assert deepsimbad("export", "route", "route.map", *THERE).code == 0
     assert document(deepsimbad("import", "route.map", "--json", *THERE))["map_version"] == 2
     assert document(deepsimbad("info", "route", "--json"))["map_version"] == 2
@@ -28,11 +28,11 @@ def test_two_data_directories_share_their_maps(deepsimbad, mapped, tmp_path):
     assert "SHA-256 differs" in checked.out
     assert deepsimbad("check", *THERE).code == 0, "the files here are whole"
     assert deepsimbad("delete-domain", "route", "--yes", *THERE).code == 0
-    gone = deepsimbad("info", "route")
-    assert (gone.code, gone.err.split(": ")[1]) == (1, "unknown_domain")
+    failure = deepsimbad("info", "route")
+    assert (failure.code, failure.err.split(": ")[1]) == (1, "unknown_domain")
 
 
-def test_what_cannot_be_is_one_line(deepsimbad, mapped, tmp_path, monkeypatch):
+def test_what_cannot_be_is_one_line(deepsimbad, mapped_dir, tmp_path, monkeypatch):
     for arguments, word in (
         (("init", "--map-store", "nowhere"), "invalid_settings"),
         (("check", "--objects"), "follows no map store"),

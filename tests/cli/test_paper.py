@@ -30,8 +30,8 @@ def encodings(tmp_path_factory):
     return folder
 
 
-def paper(deepsimbad, encodings, *more):
-    return deepsimbad("experiment", "paper", "--nclt", encodings, "--out", "out", *QUICK, *more)
+def paper(deepsimbad, encodings, *options):
+    return deepsimbad("experiment", "paper", "--nclt", encodings, "--out", "out", *QUICK, *options)
 
 
 @pytest.mark.slow
@@ -45,20 +45,20 @@ def test_figures_are_those_of_the_single_experiments_and_the_page_holds_them(dee
     assert list(document["anr"]) == ["1", "2", "4", "8"], "no list is longer than there are landmarks"
 
     sources = [part for role, date in DATES.items() for part in (f"--{role}", encodings / f"{date}.npy")]
-    usual = (*sources, "--evaluator", "feature_l2:none", "--n-landmarks", 8)
+    arguments = (*sources, "--evaluator", "feature_l2:none", "--n-landmarks", 8)
     triplet = document["by_triplet"]["WI-SP-SU"]
     for h in (2, 4):
-        single = json.loads(deepsimbad("experiment", "vpr", *usual, "--list-length", h, "--json").out)
+        single = json.loads(deepsimbad("experiment", "vpr", *arguments, "--list-length", h, "--json").out)
         assert triplet["anr"][str(h)] == {name: single["anr"][name] for name in triplet["anr"][str(h)]}
     assert triplet["recall"]["2"]["rrf"]["10"] == single["recall_at_10"]["rrf"]
     assert document["index_bits_per_map_image"]["composed"] > 0
-    active = json.loads(deepsimbad("experiment", "nbv", *usual, *QUICK[4:], "--json").out)
+    active = json.loads(deepsimbad("experiment", "nbv", *arguments, *QUICK[4:], "--json").out)
     for setup, part in (("ours", "anr"), ("paper", "anr_paper")):
         assert triplet["active"][setup] == {name: active[part][name] for name in triplet["active"][setup]}
         assert set(active[part]) - set(triplet["active"][setup]) == {"clairvoyant"}
     assert triplet["views_to_confident"]["informed"] == active["views_to_confident"]["informed"]
 
-    mean = np.mean([each["anr"]["4"]["rrf"] for each in document["by_triplet"].values()])
+    mean = np.mean([triplet_document["anr"]["4"]["rrf"] for triplet_document in document["by_triplet"].values()])
     assert document["anr"]["4"]["rrf"]["mean"] == pytest.approx(mean)
     claim = document["claims"][0]
     low, high = claim["difference"]["stretches"]
@@ -73,19 +73,21 @@ def test_figures_are_those_of_the_single_experiments_and_the_page_holds_them(dee
     assert all(label in page for label in METHODS.values())
     assert "AU is missing" in page
     rows = list(csv.DictReader((tmp_path / "out" / "figures.csv").read_text().splitlines()))
-    told = [row for row in rows if row["figure"] == "anr" and row["method"] == "rrf" and row["list_length"] == "4"]
-    assert {row["triplet"]: float(row["value"]) for row in told}["WI-SP-SU"] == triplet["anr"]["4"]["rrf"]
+    figure_rows = [
+        row for row in rows if row["figure"] == "anr" and row["method"] == "rrf" and row["list_length"] == "4"
+    ]
+    assert {row["triplet"]: float(row["value"]) for row in figure_rows}["WI-SP-SU"] == triplet["anr"]["4"]["rrf"]
     assert "| RRF |" in (tmp_path / "out" / "report.md").read_text()
 
 
 @pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_and_nothing_stale_is_taken(deepsimbad, encodings, monkeypatch):
-    done, score = [], job.score_maps
+    calls, score = [], job.score_maps
 
     def stopped_at_the_third(*arguments, **options):
-        if len(done) == 3:
+        if len(calls) == 3:
             raise CancelledError("cancelled")
-        done.append(1)
+        calls.append(1)
         return score(*arguments, **options)
 
     monkeypatch.setattr(progress, "available_cores", lambda: 1)
@@ -96,12 +98,12 @@ def test_a_run_that_was_stopped_goes_on_and_nothing_stale_is_taken(deepsimbad, e
     monkeypatch.setattr(job, "score_maps", lambda *a, **o: counted.append(1) or score(*a, **o))
     assert paper(deepsimbad, encodings).code == 0
     assert len(counted) == 2 * 4 - 3, "two triplets at four list lengths, less what was kept"
-    built, build = [], job.build_maps
-    monkeypatch.setattr(job, "build_maps", lambda *arguments: built.append(1) or build(*arguments))
+    builds, build = [], job.build_maps
+    monkeypatch.setattr(job, "build_maps", lambda *arguments: builds.append(1) or build(*arguments))
     assert paper(deepsimbad, encodings).code == 0
-    assert not built, "nothing was left to measure"
+    assert not builds, "nothing was left to measure"
     assert paper(deepsimbad, encodings, "--tolerance", 3).code == 0
-    assert len(built) == 2, "another tolerance is measured anew, on a map of each pair"
+    assert len(builds) == 2, "another tolerance is measured anew, on a map of each pair"
 
 
 @pytest.mark.slow
@@ -129,10 +131,10 @@ def test_nclt_as_downloaded_is_encoded_once_even_when_it_is_stopped(deepsimbad, 
     stop_at = 150
     monkeypatch.setattr(FeatureL2, "encode", counted)
     monkeypatch.setattr(progress, "available_cores", lambda: 1)
-    asked = ("experiment", "paper", "--nclt", tmp_path / "nclt", "--out", "out", *QUICK[2:])
-    assert deepsimbad(*asked, "--evaluator", "feature_l2:gradient_grid").code == 130
+    arguments = ("experiment", "paper", "--nclt", tmp_path / "nclt", "--out", "out", *QUICK[2:])
+    assert deepsimbad(*arguments, "--evaluator", "feature_l2:gradient_grid").code == 130
     stop_at = 10_000
-    ran = deepsimbad(*asked, "--evaluator", "feature_l2:gradient_grid", "--json")
+    ran = deepsimbad(*arguments, "--evaluator", "feature_l2:gradient_grid", "--json")
     assert ran.code == 0, ran.err
     assert len(encoded) == 3 * 112, "every image once"
     document = json.loads(ran.out)

@@ -39,8 +39,8 @@ def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, 
     if is_made:
         for _ in range(2):
             assert deepsimbad("init", "--data-dir", folder).code == 0
-        named = {"DEEPSIMBAD_PORT": str(port), "DEEPSIMBAD_HOST": "127.0.0.1", "DEEPSIMBAD_DATA_DIR": str(folder)}
-        running = process("serve", **named)
+        variables = {"DEEPSIMBAD_PORT": str(port), "DEEPSIMBAD_HOST": "127.0.0.1", "DEEPSIMBAD_DATA_DIR": str(folder)}
+        running = process("serve", **variables)
     else:
         running = process("serve", "--create", "--port", port, "--data-dir", folder)
     assert wait_until_ready(port, running) == 200
@@ -56,7 +56,7 @@ def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, 
 
 @pytest.mark.usefixtures("_logging_as_before")
 @pytest.mark.parametrize(
-    ("arguments", "code", "why"),
+    ("arguments", "code", "reason"),
     [
         (("--port", 0), "invalid_settings", "there is no data directory deepsimbad-data"),
         (("--host", "0.0.0.0", "--port", 0), "invalid_settings", "DEEPSIMBAD_ALLOW_OPEN"),
@@ -68,15 +68,15 @@ def test_it_serves_until_it_is_stopped(deepsimbad, process, tmp_path, by, code, 
         ),
     ],
 )
-def test_a_start_that_fails_is_told_in_one_record_and_one_line(deepsimbad, tmp_path, arguments, code, why):
+def test_a_start_that_fails_is_told_in_one_record_and_one_line(deepsimbad, tmp_path, arguments, code, reason):
     (tmp_path / "bad.toml").write_text("data_dri = 'there'")
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        ran = deepsimbad("serve", *(taken.getsockname()[1] if word == "taken" else word for word in arguments))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ran = deepsimbad("serve", *(server.getsockname()[1] if word == "taken" else word for word in arguments))
     assert (ran.code, ran.out) == (1, "")
     *_, record, line = ran.err.splitlines()
     logged = json.loads(record)
     assert (logged["level"], logged["message"], logged["code"]) == ("ERROR", "cannot start", code)
-    assert why in logged["why"]
+    assert reason in logged["why"]
     assert line == f"deepsimbad: {code}: {' '.join(logged['why'].split())}"
     assert {path.name for path in tmp_path.iterdir()} <= {"bad.toml", "here"}
 

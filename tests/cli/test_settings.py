@@ -10,12 +10,12 @@ from deepsimbad.cli import deepsimbad as root
 from deepsimbad.settings import Settings
 
 
-def commands(group: click.Group, *before: str) -> Iterator[tuple[str, ...]]:
+def commands(group: click.Group, *group_names: str) -> Iterator[tuple[str, ...]]:
     for name, command in group.commands.items():
         if isinstance(command, click.Group):
-            yield from commands(command, *before, name)
+            yield from commands(command, *group_names, name)
         else:
-            yield (*before, name)
+            yield (*group_names, name)
 
 
 @pytest.mark.parametrize("words", list(commands(root)), ids=" ".join)
@@ -56,8 +56,8 @@ def test_every_command_that_takes_settings_heeds_the_file(deepsimbad, tmp_path, 
     (tmp_path / "bad.toml").write_text("data_dri = 'there'")
     ran = deepsimbad(*command, "--config", "bad.toml")
     assert (ran.code, ran.out) == (1, "")
-    why = "there is no setting 'data_dri', which stands in bad.toml: did you mean 'data_dir'?"
-    assert ran.err == f"deepsimbad: invalid_settings: {why}\n"
+    message = "there is no setting 'data_dri', which stands in bad.toml: did you mean 'data_dir'?"
+    assert ran.err == f"deepsimbad: invalid_settings: {message}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 

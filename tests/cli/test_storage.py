@@ -21,34 +21,34 @@ def remark(ran, *words):
     assert all(word in ran.err for word in words)
 
 
-def test_a_backup_there_and_back(deepsimbad, mapped, tmp_path):
+def test_a_backup_there_and_back(deepsimbad, mapped_dir, tmp_path):
     report = document(deepsimbad("backup", "b.tar", "--json"))
     assert (report["n_domains"], report["n_maps"], report["n_traverses"]) == (1, 1, 2)
     assert report["bytes"] == (tmp_path / "b.tar").stat().st_size
     assert report["sha256"] == hashlib.sha256((tmp_path / "b.tar").read_bytes()).hexdigest()
-    before = document(deepsimbad("info", "route", "--json"))
+    description = document(deepsimbad("info", "route", "--json"))
     assert document(deepsimbad("restore", "b.tar", "--data-dir", "there", "--json"))["n_files"] == 4
-    assert document(deepsimbad("info", "route", "--json", "--data-dir", "there")) == before
+    assert document(deepsimbad("info", "route", "--json", "--data-dir", "there")) == description
     remark(deepsimbad("backup", "c.tar"), "1 domains, 1 maps, 2 traverses")
     remark(deepsimbad("restore", "c.tar", "--data-dir", "elsewhere"))
 
 
-def test_a_map_moves(deepsimbad, mapped, tmp_path):
-    sent = document(deepsimbad("export", "route", "route.map", "--json"))
-    assert (sent["domain"], sent["map_version"]) == ("route", 1)
-    there = ("--data-dir", "there")
-    got = document(deepsimbad("import", "route.map", *there, "--sha256", sent["sha256"], "--json"))
-    kept = {"domain": "route", "map_version": 1, "active": True, "domain_is_new": True}
-    assert got == {**kept, "bytes": sent["bytes"], "sha256": sent["sha256"]}
-    before, after = (
-        document(deepsimbad("info", "route", "--json", "--data-dir", place)) for place in (mapped, "there")
+def test_a_map_moves(deepsimbad, mapped_dir, tmp_path):
+    exported = document(deepsimbad("export", "route", "route.map", "--json"))
+    assert (exported["domain"], exported["map_version"]) == ("route", 1)
+    arguments = ("--data-dir", "there")
+    imported = document(deepsimbad("import", "route.map", *arguments, "--sha256", exported["sha256"], "--json"))
+    expected = {"domain": "route", "map_version": 1, "active": True, "domain_is_new": True}
+    assert imported == {**expected, "bytes": exported["bytes"], "sha256": exported["sha256"]}
+    description, new_description = (
+        document(deepsimbad("info", "route", "--json", "--data-dir", place)) for place in (mapped_dir, "there")
     )
-    assert {**before, "created_at": ""} == {**after, "created_at": ""}
+    assert {**description, "created_at": ""} == {**new_description, "created_at": ""}
     remark(deepsimbad("export", "route", "again.map", "--version", 1), "map 1 of route is in again.map")
     remark(deepsimbad("import", "again.map", "--no-activate", "--domain", "other"), "map 1 of other is sealed")
 
 
-def test_errors_are_one_line(deepsimbad, mapped, tmp_path):
+def test_errors_are_one_line(deepsimbad, mapped_dir, tmp_path):
     assert deepsimbad("backup", "b.tar").code == deepsimbad("export", "route", "route.map").code == 0
     for arguments, word in (
         (("backup", "b.tar"), "never replaces a file"),
@@ -73,13 +73,13 @@ def test_errors_are_one_line(deepsimbad, mapped, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_a_check_names_damage_and_ends_with_1(deepsimbad, mapped):
+def test_a_check_names_damage_and_ends_with_1(deepsimbad, mapped_dir):
     remark(deepsimbad("check"), "4 files read, 0 problems\n")
     assert document(deepsimbad("check", "--json")) == {"ok": True, "n_files": 4, "damaged": []}
-    path = mapped / "domains" / "route" / "maps" / "000001.sqlite"
+    path = mapped_dir / "domains" / "route" / "maps" / "000001.sqlite"
     path.chmod(0o644)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
-    (mapped / "domains" / "route" / "traverses" / "half.new").touch()  # what a crash leaves is no damage
+    (mapped_dir / "domains" / "route" / "traverses" / "half.new").touch()  # what a crash leaves is no damage
     ran = deepsimbad("check")
     (damaged,) = ran.out.splitlines()
     assert ran.code == 1
@@ -88,14 +88,14 @@ def test_a_check_names_damage_and_ends_with_1(deepsimbad, mapped):
     assert (ran.code, json.loads(ran.out)["ok"]) == (1, False)
     path.unlink()
     assert deepsimbad("check").code == 1
-    (mapped / "catalog.sqlite").unlink()
+    (mapped_dir / "catalog.sqlite").unlink()
     ran = deepsimbad("check")
     assert ran.code == 1
     assert ran.out.startswith("damaged: catalog.sqlite: ")
 
 
 @pytest.mark.slow
-def test_a_running_service_serves_an_imported_map_within_about_a_second(deepsimbad, mapped, tmp_path):
+def test_a_running_service_serves_an_imported_map_within_about_a_second(deepsimbad, mapped_dir, tmp_path):
     assert deepsimbad("export", "route", "route.map").code == 0
     with LocalServer(tmp_path / "there", tmp_path / "log") as server, Client(server.url) as client:
         assert client.domains() == ()

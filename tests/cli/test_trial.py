@@ -59,8 +59,10 @@ def test_queries_are_shown_by_the_grey_levels_of_the_map(deepsimbad, pictures, t
             image = cv2.imread(str(pictures / f"{place}.png")).astype(np.uint16)
             cv2.imwrite(str(tmp_path / name / f"{place}.png"), image * (gain if place else 4))  # the first is in both
     assert deepsimbad("try", "database", "queries#:1", *QUICK, "--out", "out").code == 0
-    kept = [np.load(next((tmp_path / "out").rglob(f"{role}*.npz")))["encodings"][0] for role in ("database", "queries")]
-    np.testing.assert_array_equal(*kept)
+    encodings = [
+        np.load(next((tmp_path / "out").rglob(f"{role}*.npz")))["encodings"][0] for role in ("database", "queries")
+    ]
+    np.testing.assert_array_equal(*encodings)
 
 
 def test_two_folders_give_figures_and_one_page_that_asks_for_nothing(deepsimbad, pictures, queries, tmp_path):
@@ -97,14 +99,14 @@ def test_a_picture_is_small_and_of_the_frames_shape(tmp_path, size):
     cv2.imwrite(str(tmp_path / "0.png"), view)
     drive = Drive(position_m=np.zeros(1), encodings=np.ones((1, 2), np.float32))
     album = Album(open_source(str(tmp_path)), drive, 10**6)
-    picture = album.shown(0)["picture"]
+    picture = album.entry(0)["picture"]
     shrunk = max(1.0, max(size) / 200)
     assert (picture["width"], picture["height"]) == (round(size[0] / shrunk), round(size[1] / shrunk))
     body = b64decode(picture["uri"].partition("base64,")[2])
-    shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
-    assert shown.shape[:2] == (picture["height"], picture["width"])
-    assert (shown[:, : picture["width"] // 3] < 60).all()
-    assert (shown[:, -picture["width"] // 3 :] > 200).all()
+    image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape[:2] == (picture["height"], picture["width"])
+    assert (image[:, : picture["width"] // 3] < 60).all()
+    assert (image[:, -picture["width"] // 3 :] > 200).all()
     assert album.n_bytes == len(body)
 
 
@@ -126,7 +128,7 @@ def test_a_second_run_encodes_nothing_and_one_that_was_stopped_goes_on(
     assert stopped.code == 130
     assert "the same command goes on where it stopped" in stopped.err
     monkeypatch.setattr(FeatureL2, "encode", encode)
-    whole = deepsimbad("try", pictures, queries, *QUICK, "--out", "elsewhere", "--json")
+    uninterrupted = deepsimbad("try", pictures, queries, *QUICK, "--out", "elsewhere", "--json")
 
     encoded.clear()
     monkeypatch.setattr(FeatureL2, "encode", counted)
@@ -134,7 +136,7 @@ def test_a_second_run_encodes_nothing_and_one_that_was_stopped_goes_on(
     assert (gone_on.code, len(encoded)) == (0, 20)
     figures = [
         {name: json.loads(ran.out)[name] for name in ("anr", "recall_at", "fails", "config")}
-        for ran in (whole, gone_on)
+        for ran in (uninterrupted, gone_on)
     ]
     assert figures[0] == figures[1]
 

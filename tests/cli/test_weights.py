@@ -39,13 +39,13 @@ class Files:
     tear: dict[str, list[int]] = field(default_factory=dict)  # a path's next answers break off after so many bytes
     status: dict[str, int] = field(default_factory=dict)  # a path is answered with this status alone
     headers: dict[str, str] = field(default_factory=dict)  # of every answer
-    asked: list[tuple[str, str | None]] = field(default_factory=list)  # path and Range of every request
+    requests: list[tuple[str, str | None]] = field(default_factory=list)  # path and Range of every request
     has_etag: bool = True
 
 
 @pytest.fixture
 def files() -> Iterator[Files]:
-    served = Files()
+    new_files = Files()
 
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_):
@@ -58,16 +58,16 @@ def files() -> Iterator[Files]:
             self.end_headers()
 
         def do_GET(self):
-            wanted = self.headers["Range"]
-            served.asked.append((self.path, wanted))
-            content = served.content.get(self.path)
-            status = served.status.get(self.path, 200 if content is not None else 404)
+            byte_range = self.headers["Range"]
+            new_files.requests.append((self.path, byte_range))
+            content = new_files.content.get(self.path)
+            status = new_files.status.get(self.path, 200 if content is not None else 404)
             if status != 200:
                 self.refuse(status)
                 return
             etag, first = f'"{hashlib.sha256(content).hexdigest()}"', 0
-            if wanted and self.headers["If-Range"] in {None, etag}:
-                first = int(wanted.removeprefix("bytes=").removesuffix("-"))
+            if byte_range and self.headers["If-Range"] in {None, etag}:
+                first = int(byte_range.removeprefix("bytes=").removesuffix("-"))
                 if first >= len(content):
                     self.refuse(416, ("Content-Range", f"bytes */{len(content)}"))
                     return
@@ -75,21 +75,21 @@ def files() -> Iterator[Files]:
                 self.send_header("Content-Range", f"bytes {first}-{len(content) - 1}/{len(content)}")
             else:
                 self.send_response(200)
-            for name, value in (*served.headers.items(), ("Content-Length", len(content) - first)):
+            for name, value in (*new_files.headers.items(), ("Content-Length", len(content) - first)):
                 self.send_header(name, str(value))
-            if served.has_etag:
+            if new_files.has_etag:
                 self.send_header("ETag", etag)
             self.end_headers()
-            torn = served.tear.get(self.path)
+            torn = new_files.tear.get(self.path)
             with contextlib.suppress(OSError):  # who asked may have heard enough
                 self.wfile.write(content[first : first + torn.pop(0)] if torn else content[first:])
             self.close_connection = True
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    served.url = f"http://127.0.0.1:{server.server_port}"
+    new_files.url = f"http://127.0.0.1:{server.server_port}"
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
-    yield served
+    yield new_files
     server.shutdown()
     thread.join()
     server.server_close()
@@ -100,14 +100,14 @@ def repository(files, monkeypatch) -> Files:
     """someone/Places, as GitHub would give it, and the checkpoint that it downloads."""
     stream = io.BytesIO()
     torch.manual_seed(0)
-    torch.save({f"2.{name}": each for name, each in torch.nn.Linear(3, 6).state_dict().items()}, stream)
+    torch.save({f"2.{name}": array for name, array in torch.nn.Linear(3, 6).state_dict().items()}, stream)
     digest = hashlib.sha256(stream.getvalue()).hexdigest()[:8]
     files.content[f"/checkpoint-{digest}.pth"] = stream.getvalue()
     for commit in (COMMIT, NEWER):
         archive = io.BytesIO()
-        with zipfile.ZipFile(archive, "w") as opened:
+        with zipfile.ZipFile(archive, "w") as zip_file:
             text = HUBCONF.replace("{url}", files.url).replace("{digest}", digest)
-            opened.writestr(f"Places-{commit}/hubconf.py", text + f"# {commit}")
+            zip_file.writestr(f"Places-{commit}/hubconf.py", text + f"# {commit}")
         files.content[f"/someone/Places/archive/{commit}.zip"] = archive.getvalue()
     files.content["/repos/someone/Places/commits/HEAD"] = COMMIT.encode()
     monkeypatch.setattr(downloads, "GITHUB", files.url)
@@ -127,33 +127,33 @@ def pull(deepsimbad, files):
 
 
 @pytest.fixture
-def listed(deepsimbad):
+def list_rows(deepsimbad):
     """The rows of `weights list`."""
     return lambda: json.loads(deepsimbad("weights", "list", "--json", *IN).out)
 
 
-def test_the_known_ones_are_listed(deepsimbad, listed, tmp_path):
+def test_the_known_ones_are_listed(deepsimbad, list_rows, tmp_path):
     ran = deepsimbad("weights", "list", *IN)
     assert (ran.code, ran.err) == (0, "")
     for word in ("torchhub:gmberton/MegaLoc:get_trained_model", "8448", "322x322", "GPL-3.0", "529 MB", "netvlad:"):
         assert word in ran.out
     assert not (tmp_path / "w").exists()
-    rows = {row["name"]: row for row in listed()}
+    rows = {row["name"]: row for row in list_rows()}
     assert rows["boq"]["extractor"] == "torchhub:amaralibey/Bag-of-Queries:get_trained_boq"
     assert rows["boq"]["packages"] == ["torchvision"]
     assert rows["boq"]["state"] == "-"
     assert rows["efficientnet-lite0"]["state"] == "with its package"
 
 
-def test_what_was_pulled_or_put_there_is_listed(pull, deepsimbad, files, tmp_path, listed):
+def test_what_was_pulled_or_put_there_is_listed(pull, deepsimbad, files, tmp_path, list_rows):
     (tmp_path / "w").mkdir()
     (tmp_path / "w" / "vgg16_netvlad.pth").write_bytes(b"x")
     assert pull().code == 0
-    rows = {row["extractor"]: row for row in listed()}
+    rows = {row["extractor"]: row for row in list_rows()}
     assert rows["netvlad:vgg16_netvlad.pth"]["state"] == "not recorded"
     assert (rows["onnx:m.onnx"]["state"], rows["onnx:m.onnx"]["size_mb"]) == ("pulled", 2.3)
     (tmp_path / "w" / "m.onnx").unlink()
-    rows = {row["extractor"]: row for row in listed()}
+    rows = {row["extractor"]: row for row in list_rows()}
     assert rows["onnx:m.onnx"]["state"] == "missing"
     assert "onnx:m.onnx" in deepsimbad("weights", "list", *IN).out
 
@@ -167,7 +167,7 @@ def test_a_file_is_pulled_recorded_and_verified(pull, deepsimbad, files, tmp_pat
     ran = deepsimbad("weights", "verify", *IN)
     assert (ran.code, ran.out) == (0, f"good: w/m.onnx: {SHA256}\n")
     assert deepsimbad("weights", "pull", "onnx:m.onnx", *IN).code == 0, "it is here"
-    assert len(files.asked) == 1
+    assert len(files.requests) == 1
     (tmp_path / "w" / "m.onnx").write_bytes(b"changed")
     ran = deepsimbad("weights", "verify", "onnx:m.onnx", *IN)
     assert ran.code == 1
@@ -188,7 +188,7 @@ def test_a_download_that_breaks_off_goes_on(pull, files):
     files.tear["/m.onnx"] = [1000, 500_000]
     ran = pull("--sha256", SHA256[:8])
     assert ran.code == 0, ran.err
-    assert [wanted for _, wanted in files.asked] == [None, "bytes=1000-", "bytes=501000-"]
+    assert [byte_range for _, byte_range in files.requests] == [None, "bytes=1000-", "bytes=501000-"]
 
 
 def _broken_off(pull, files, tmp_path, *options):
@@ -201,54 +201,58 @@ def _broken_off(pull, files, tmp_path, *options):
     assert (tmp_path / "w" / "m.onnx.part").exists()
     assert not (tmp_path / "w" / "m.onnx").exists()
     files.tear.clear()
-    files.asked.clear()
+    files.requests.clear()
 
 
 @pytest.mark.parametrize(
-    ("has_etag", "options", "wanted"),
+    ("has_etag", "options", "byte_range"),
     [(True, (), "bytes=1000-"), (False, (), None), (False, ("--sha256", SHA256), "bytes=1000-")],
 )
-def test_a_later_pull_goes_on_where_the_file_is_the_same(pull, files, tmp_path, has_etag, options, wanted):
+def test_a_later_pull_goes_on_where_the_file_is_the_same(pull, files, tmp_path, has_etag, options, byte_range):
     """As the server's tag says, or the digest that is asked for."""
     files.has_etag = has_etag
     _broken_off(pull, files, tmp_path, *options)
     ran = pull(*options)
     assert ran.code == 0, ran.err
     assert (tmp_path / "w" / "m.onnx").read_bytes() == CONTENT
-    assert files.asked == [("/m.onnx", wanted)]
+    assert files.requests == [("/m.onnx", byte_range)]
     assert sorted(path.name for path in (tmp_path / "w").iterdir()) == ["m.onnx", "weights.lock"]
 
 
-@pytest.mark.parametrize("now", [CONTENT[::-1], CONTENT[:10], CONTENT[:1000]])
-def test_a_file_that_has_changed_meanwhile_comes_anew(pull, files, tmp_path, now):
+@pytest.mark.parametrize("new_content", [CONTENT[::-1], CONTENT[:10], CONTENT[:1000]])
+def test_a_file_that_has_changed_meanwhile_comes_anew(pull, files, tmp_path, new_content):
     _broken_off(pull, files, tmp_path)
-    files.content["/m.onnx"] = now
+    files.content["/m.onnx"] = new_content
     assert pull().code == 0
-    assert (tmp_path / "w" / "m.onnx").read_bytes() == now
+    assert (tmp_path / "w" / "m.onnx").read_bytes() == new_content
 
 
 def test_a_part_that_is_the_whole_file_or_longer(pull, files, tmp_path):
     """The server says "beyond the end": either nothing is missing, or it is no part of this file."""
     files.has_etag = False
-    for there in (CONTENT, CONTENT + b"x"):
+    for part_content in (CONTENT, CONTENT + b"x"):
         (tmp_path / "w").mkdir(exist_ok=True)
         (tmp_path / "w" / "m.onnx").unlink(missing_ok=True)
-        (tmp_path / "w" / "m.onnx.part").write_bytes(there)
+        (tmp_path / "w" / "m.onnx.part").write_bytes(part_content)
         ran = pull("--sha256", SHA256)
         assert ran.code == 0, ran.err
         assert (tmp_path / "w" / "m.onnx").read_bytes() == CONTENT
-    assert [wanted for _, wanted in files.asked] == [f"bytes={len(CONTENT)}-", f"bytes={len(CONTENT) + 1}-", None]
+    assert [byte_range for _, byte_range in files.requests] == [
+        f"bytes={len(CONTENT)}-",
+        f"bytes={len(CONTENT) + 1}-",
+        None,
+    ]
 
 
 @pytest.mark.parametrize(
-    ("status", "headers", "told"),
+    ("status", "headers", "message"),
     [(404, {}, "answered 404"), (503, {}, "answered 503"), (200, {"Content-Type": "text/html"}, "answered a page")],
 )
-def test_what_is_no_file_is_not_kept(pull, files, tmp_path, status, headers, told):
+def test_what_is_no_file_is_not_kept(pull, files, tmp_path, status, headers, message):
     files.status["/m.onnx"], files.headers = status, headers
     ran = pull()
     assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
-    assert told in ran.err
+    assert message in ran.err
     assert "put it at w/m.onnx" in ran.err
     assert list((tmp_path / "w").iterdir()) == []
 
@@ -272,7 +276,7 @@ def test_without_a_network_it_says_which_file_to_put_where(deepsimbad, tmp_path,
     assert (ran.code, ran.err) == (0, f"onnx:m.onnx is at w/m.onnx, sha256 {SHA256}\n")
 
 
-def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repository, tmp_path, listed):
+def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repository, tmp_path, list_rows):
     ran = deepsimbad("weights", "pull", HUB, "--yes", "--input-size", "28x28", "--json", *IN)
     assert ran.code == 0, ran.err
     assert f"{HUB} runs the code of github.com/someone/Places on this machine" in ran.err
@@ -286,15 +290,15 @@ def test_a_repository_is_pulled_at_a_commit_and_held_to_it(deepsimbad, repositor
     ran = deepsimbad("weights", "verify", HUB, *IN)
     assert (ran.code, ran.out.count("good: ")) == (0, 2)
     repository.content["/repos/someone/Places/commits/HEAD"] = NEWER.encode()
-    asked = len(repository.asked)
+    n_requests = len(repository.requests)
     assert deepsimbad("weights", "pull", HUB, "--yes", *IN).code == 0
-    assert len(repository.asked) == asked, "what is here as recorded is not fetched again"
+    assert len(repository.requests) == n_requests, "what is here as recorded is not fetched again"
     assert json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"] == {HUB.lower(): record}
     assert deepsimbad("weights", "pull", HUB, "--yes", "--commit", NEWER, "--argument", "dim=6", *IN).code == 0
     (changed,) = json.loads((tmp_path / "w" / "weights.lock").read_text())["hub"].values()
     assert (changed["commit"], changed["arguments"]) == (NEWER, {"dim": 6})
     assert not (tmp_path / "w" / "hub" / f"someone_Places_{COMMIT}").exists()
-    (row,) = [row for row in listed() if row["state"] == "pulled"]
+    (row,) = [row for row in list_rows() if row["state"] == "pulled"]
     assert (row["name"], row["encoding_dim"], row["input"]) == ("someone/Places", 6, "28x28")
     (tmp_path / "w" / "hub" / f"someone_Places_{NEWER}" / "hubconf.py").write_text("changed")
     ran = deepsimbad("weights", "verify", *IN)
@@ -315,7 +319,7 @@ def test_nobodys_code_is_run_unasked(deepsimbad, repository, tmp_path):
     ran = deepsimbad("weights", "pull", HUB, *IN)
     assert (ran.code, ran.out) == (2, "")
     assert "say --yes if you trust it" in ran.err
-    assert repository.asked == []
+    assert repository.requests == []
     assert not (tmp_path / "w").exists()
 
 
@@ -326,7 +330,7 @@ def test_a_person_is_asked(deepsimbad, repository, monkeypatch, answer, code):
     ran = deepsimbad("weights", "pull", HUB, "--input-size", "28x28", *IN)
     assert ran.code == code
     assert "runs the code of github.com/someone/Places" in ran.err
-    assert bool(repository.asked) == (code == 0)
+    assert bool(repository.requests) == (code == 0)
 
 
 def test_a_repository_without_a_network(deepsimbad, monkeypatch, tmp_path):
@@ -337,9 +341,9 @@ def test_a_repository_without_a_network(deepsimbad, monkeypatch, tmp_path):
     assert "--commit" in ran.err.splitlines()[-1]
     ran = deepsimbad("weights", "pull", HUB, "--yes", "--commit", COMMIT, *IN)
     assert ran.code == 1
-    told = ran.err.splitlines()[-1]
-    assert f"http://127.0.0.1:9/someone/Places/archive/{COMMIT}.zip cannot be reached" in told
-    assert f"put it at {tmp_path}/w/hub/someone_Places_{COMMIT}.zip and pull again" in told
+    message = ran.err.splitlines()[-1]
+    assert f"http://127.0.0.1:9/someone/Places/archive/{COMMIT}.zip cannot be reached" in message
+    assert f"put it at {tmp_path}/w/hub/someone_Places_{COMMIT}.zip and pull again" in message
 
 
 @pytest.mark.parametrize(
@@ -361,7 +365,7 @@ def test_usage(deepsimbad, tmp_path, arguments):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("pull", "nothing"), "is no name of"),
         (("pull", "onnx:../a.onnx"), "is no name of"),
@@ -373,10 +377,10 @@ def test_usage(deepsimbad, tmp_path, arguments):
         (("verify", "megaloc"), "was never pulled to w"),
     ],
 )
-def test_mistakes_are_named(deepsimbad, arguments, told):
+def test_mistakes_are_named(deepsimbad, arguments, message):
     ran = deepsimbad("weights", *arguments, *IN)
     assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
-    assert told in ran.err
+    assert message in ran.err
 
 
 def test_nothing_pulled_is_nothing_to_verify(deepsimbad, monkeypatch, tmp_path):

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from deepsimbad.api.app import create_app
 from deepsimbad.cli import deepsimbad
-from deepsimbad.cli.serve import shown as shown_setting
+from deepsimbad.cli.serve import setting_text
 from deepsimbad.settings import CONFIG_VARIABLE, Settings, trace_settings, variable_of
 from deepsimbad_client.commands import cli as deepsimbad_client
 from deepsimbad_client.http.wire import KEY_VARIABLE, URL_VARIABLE
@@ -74,7 +74,7 @@ def test_the_table_of_settings_tells_default_and_meaning(variable):
     field = settings_by_variable()[variable]
     (row,) = [line for line in SETTINGS_PAGE.text.splitlines() if line.startswith(f"| `{variable}`")]
     _, _, default, meaning, _ = (cell.strip() for cell in row.split("|"))
-    assert default == f"`{shown_setting(field.default)}`"
+    assert default == f"`{setting_text(field.default)}`"
     assert meaning == field.description
 
 

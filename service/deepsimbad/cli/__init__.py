@@ -15,7 +15,7 @@ from deepsimbad.errors import CancelledError, DeepSimbadError, UnavailableError
 from deepsimbad_client.errors import DeepSimbadClientError
 
 _FAILED, _CANCELLED = 1, 130
-_HOMES = {
+_COMMAND_PLACES = {  # module:attribute
     "experiment": "paper:experiment",
     "ray": "ray:ray",
     "try": "trial:try_",
@@ -29,7 +29,7 @@ _HOMES = {
 }
 
 
-class _Late(UserDict[str, Any]):
+class _LazyCommands(UserDict[str, Any]):
     """Commands, each imported when it is asked for: most take half a second of imports that others do without."""
 
     def __getitem__(self, name: str) -> click.Command:
@@ -38,7 +38,7 @@ class _Late(UserDict[str, Any]):
         return command
 
 
-@click.group(commands=_Late(_HOMES), context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(commands=_LazyCommands(_COMMAND_PLACES), context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="deep-simbad", message="%(version)s")
 def deepsimbad() -> None:
     """Where on a known route a robot is, and which move would tell it most next."""

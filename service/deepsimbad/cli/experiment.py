@@ -66,7 +66,7 @@ tolerance_option = click.option(
 
 
 def _triplet_options(command: Command) -> Command:
-    """The options that every experiment has; their values are `asked` of what follows."""
+    """The options that every experiment has; commands take their values as `options`."""
     options = (
         click.option("--landmarks", required=True, help="SOURCE landmarks are selected from."),
         click.option("--training", required=True, help="SOURCE that becomes the map."),
@@ -89,7 +89,7 @@ def _triplet_options(command: Command) -> Command:
         # As every command does, so that a script may give it to all of them
         folder_option("--data-dir", "Taken as by every command; an experiment reads and keeps nothing there.", None),
     )
-    return reduce(lambda decorated, option: option(decorated), reversed(options), command)
+    return reduce(lambda inner_command, option: option(inner_command), reversed(options), command)
 
 
 @click.group()
@@ -119,46 +119,48 @@ def vpr(
     names: tuple[str, ...],
     tolerance: float | None,
     ground_truth: Path | None,
-    **asked: Any,
+    **options: Any,
 ) -> None:
     """Single-view place recognition (III, figure 6): ANR and recall of every relevance.
 
     Beside it the drive in order: what composed's belief makes of the last 1 to 20 views, and what sums make of them.
     """
     relevances = tuple(Relevance(name) for name in names) or tuple(Relevance)
-    if asked["bar_own_place"]:
+    if options["bar_own_place"]:
         if set(names) - {Relevance.COMPOSED.value}:
             raise click.UsageError("--bar-own-place is of composed alone")
         relevances = (Relevance.COMPOSED,)
-    same_route = asked["same_route"]
+    same_route = options["same_route"]
     if same_route is None and ground_truth is None:
         same_route = True  # test and training are scored by their positions: they count along one route
     config = VprConfig(
-        list_length=asked["list_length"],
+        list_length=options["list_length"],
         relevances=relevances,
-        stateless=asked["stateless"],
+        stateless=options["stateless"],
         same_route=same_route,
-        bar_own_place=asked["bar_own_place"],
+        bar_own_place=options["bar_own_place"],
     )
     documents: dict[str, Any] = {}
     reports: dict[str, VprReport] = {}
     for evaluator in evaluators:
         extractor = evaluator.extractor
         with progress_bar(_READING_STAGES | vpr_stages(config), extractor) as progress:
-            read = _Triplet.read(asked, evaluator, progress)
-            tolerance_m = read.tolerance_m if tolerance is None else tolerance
-            config = replace(config, n_landmarks=read.n_landmarks, tolerance_m=tolerance_m)
-            landmarks, training, test = read.drives
+            triplet = _Triplet.read(options, evaluator, progress)
+            tolerance_m = triplet.tolerance_m if tolerance is None else tolerance
+            config = replace(config, n_landmarks=triplet.n_landmarks, tolerance_m=tolerance_m)
+            landmarks, training, test = triplet.drives
             truth = true_images(test, training, tolerance_m, ground_truth)
-            report = run_vpr(*(config, read.evaluator, landmarks, training, read.test, truth, progress), read.pictures)
-        sources = {**read.sources, "ground_truth": None if ground_truth is None else str(ground_truth)}
-        documents[extractor] = {**report.as_dict(sources), "warnings": [*read.warnings, *report.warnings]}
+            report = run_vpr(
+                *(config, triplet.evaluator, landmarks, training, triplet.test, truth, progress), triplet.pictures
+            )
+        sources = {**triplet.sources, "ground_truth": None if ground_truth is None else str(ground_truth)}
+        documents[extractor] = {**report.as_dict(sources), "warnings": [*triplet.warnings, *report.warnings]}
         reports[extractor] = report
     if len(reports) > 1:
-        whole = {"extractors": documents, "warnings": read.warnings}
-        tell(whole, asked["json_file"], lambda: _print_extractors(reports))
+        document = {"extractors": documents, "warnings": triplet.warnings}
+        tell(document, options["json_file"], lambda: _print_extractors(reports))
     else:
-        tell(documents[extractor], asked["json_file"], lambda: _print_relevances(report))
+        tell(documents[extractor], options["json_file"], lambda: _print_relevances(report))
 
 
 @experiment.command()
@@ -175,24 +177,24 @@ def vpr(
     "--episodes", type=click.IntRange(min=2), help="Test episodes of every planner, drawn.  [default: from every start]"
 )
 @seed_option
-def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, **asked: Any) -> None:
+def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, **options: Any) -> None:
     """Active self-localization (III, figure 7): ANR of every planner over episodes of ten moves.
 
     Every planner has the same starts. The paper's set-up (rrf, additive relevance) is measured beside ours.
     """
-    chosen = Relevance(relevance) if relevance else DEFAULT_RELEVANCE
+    our_relevance = Relevance(relevance) if relevance else DEFAULT_RELEVANCE
     config = NbvConfig(
-        relevance=chosen,
-        update=UpdateRule(update) if update else DEFAULT_UPDATE[chosen],
-        same_route=asked["same_route"] is not False,
-        **{name: asked[name] for name in ("list_length", "training_episodes", "episodes", "seed")},
+        relevance=our_relevance,
+        update=UpdateRule(update) if update else DEFAULT_UPDATE[our_relevance],
+        same_route=options["same_route"] is not False,
+        **{name: options[name] for name in ("list_length", "training_episodes", "episodes", "seed")},
     )
     with progress_bar(_READING_STAGES | nbv_stages(config), "experiment") as progress:
-        read = _Triplet.read(asked, evaluator, progress)
-        config = replace(config, n_landmarks=read.n_landmarks)
-        report = run_nbv(config, read.evaluator, *read.drives, progress, read.pictures)
-    document = {**report.as_dict(read.sources), "warnings": read.warnings}
-    tell(document, asked["json_file"], lambda: _print_planners(report, document))
+        triplet = _Triplet.read(options, evaluator, progress)
+        config = replace(config, n_landmarks=triplet.n_landmarks)
+        report = run_nbv(config, triplet.evaluator, *triplet.drives, progress, triplet.pictures)
+    document = {**report.as_dict(triplet.sources), "warnings": triplet.warnings}
+    tell(document, options["json_file"], lambda: _print_planners(report, document))
 
 
 @experiment.command()
@@ -210,7 +212,7 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
     help="How beliefs are kept.",
 )
 @seed_option
-def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **asked: Any) -> None:
+def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **options: Any) -> None:
     """How far a belief can be trusted: its 95 % sets and its sure answers against the truth.
 
     Of robots that drive, stand still, are carried, leave the route, or misjudge their moves; on 250 m at least.
@@ -218,15 +220,15 @@ def calibration(evaluator: EvaluatorConfig, relevance: str, filter_name: str, **
     config = CalibrationConfig(
         relevance=Relevance(relevance),
         filter=FilterKind(filter_name),
-        same_route=asked["same_route"] is not False,
-        **{name: asked[name] for name in ("list_length", "seed")},
+        same_route=options["same_route"] is not False,
+        **{name: options[name] for name in ("list_length", "seed")},
     )
     with progress_bar(_READING_STAGES | calibration_stages(), "experiment") as progress:
-        read = _Triplet.read(asked, evaluator, progress)
-        config = replace(config, n_landmarks=read.n_landmarks)
-        report = run_calibration(config, read.evaluator, *read.drives, progress, read.pictures)
-    document = {**report.as_dict(read.sources), "warnings": read.warnings}
-    tell(document, asked["json_file"], lambda: _print_calibration(document, report.same_route))
+        triplet = _Triplet.read(options, evaluator, progress)
+        config = replace(config, n_landmarks=triplet.n_landmarks)
+        report = run_calibration(config, triplet.evaluator, *triplet.drives, progress, triplet.pictures)
+    document = {**report.as_dict(triplet.sources), "warnings": triplet.warnings}
+    tell(document, options["json_file"], lambda: _print_calibration(document, report.same_route))
 
 
 @dataclass(frozen=True)
@@ -237,45 +239,45 @@ class _Triplet:
     drives: tuple[Drive, Drive, Drive]  # landmarks, training, test
     test: EncodedRecording
     n_landmarks: int  # as many as are asked for, or fit
-    tolerance_m: float  # that papers on this set have, or ours
+    tolerance_m: float  # as `usual_tolerance_m`
     sources: dict[str, Any]  # what was read, for the result's `config`
     warnings: list[str]
     pictures: Pictures  # of the landmark recording
 
     @classmethod
-    def read(cls, asked: dict[str, Any], config: EvaluatorConfig, progress: Progress) -> Self:
-        """Open all, then encode: a mistake in what was typed should cost no minutes."""
+    def read(cls, options: dict[str, Any], config: EvaluatorConfig, progress: Progress) -> Self:
+        """Open all recordings, then encode them: a mistake in what was typed should cost no minutes."""
         settings = given_settings()
         evaluator = make_evaluator(config, settings.compute())
-        opened = [open_source(asked[role], spacing_m=asked["spacing_m"]) for role in _ROLES]
-        fitting_number(asked["n_landmarks"], len(opened[0].frames), _N_LANDMARKS)
-        opened[2] = opened[2].shown_by(opened[1].grey_levels)  # as live views are
-        recordings = []
-        for stage, recording in zip(_READING_STAGES, opened, strict=True):
+        recordings = [open_source(options[role], spacing_m=options["spacing_m"]) for role in _ROLES]
+        fitting_number(options["n_landmarks"], len(recordings[0].frames), _N_LANDMARKS)
+        recordings[2] = recordings[2].shown_by(recordings[1].grey_levels)  # as live views are
+        encoded_recordings = []
+        for stage, recording in zip(_READING_STAGES, recordings, strict=True):
             progress.stage(stage)
-            recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
-        landmarks, training, test = (recording.drive for recording in recordings)
+            encoded_recordings.append(encode_recording(recording, evaluator, settings.max_pixels, progress.update))
+        landmarks, training, test = (recording.drive for recording in encoded_recordings)
         sources = {
-            **{role: asked[role] for role in _ROLES},
+            **{role: options[role] for role in _ROLES},
             "evaluator": config.as_dict(),
-            "spacing_m": asked["spacing_m"],
-            "left_out": {role: recording.left_out for role, recording in zip(_ROLES, recordings, strict=True)},
+            "spacing_m": options["spacing_m"],
+            "left_out": {role: recording.left_out for role, recording in zip(_ROLES, encoded_recordings, strict=True)},
         }
-        n_landmarks = fitting_number(asked["n_landmarks"], landmarks.n_frames, _N_LANDMARKS)
+        n_landmarks = fitting_number(options["n_landmarks"], landmarks.n_frames, _N_LANDMARKS)
         warnings = test_drive_warnings(test, landmarks=landmarks, training=training)
-        for role, recording, encoded in zip(_ROLES, opened, recordings, strict=True):
+        for role, recording, encoded_recording in zip(_ROLES, recordings, encoded_recordings, strict=True):
             warnings += [f"{role}: {remark}" for remark in recording.remarks]
-            warnings += [f"{role}: {line}" for line in left_out_lines(encoded.left_out_names, verbose=False)]
-        pictures = RecordingPictures(opened[0], settings.max_pixels)
-        tolerance_m = usual_tolerance_m(*opened)
+            warnings += [f"{role}: {line}" for line in left_out_lines(encoded_recording.left_out_names, verbose=False)]
+        pictures = RecordingPictures(recordings[0], settings.max_pixels)
+        tolerance_m = usual_tolerance_m(*recordings)
         drives = landmarks, training, test
-        return cls(evaluator, drives, recordings[2], n_landmarks, tolerance_m, sources, warnings, pictures)
+        return cls(evaluator, drives, encoded_recordings[2], n_landmarks, tolerance_m, sources, warnings, pictures)
 
 
 def usual_tolerance_m(*recordings: Recording) -> float:
-    """What papers on a set that the recordings are of count as true, the strictest; else our own."""
-    known = [recording.tolerance_m for recording in recordings if recording.tolerance_m is not None]
-    return min(known, default=DEFAULT_TOLERANCE_M)
+    """The strictest tolerance of papers on the sets that the recordings are of; else our own."""
+    tolerances_m = [recording.tolerance_m for recording in recordings if recording.tolerance_m is not None]
+    return min(tolerances_m, default=DEFAULT_TOLERANCE_M)
 
 
 def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | None) -> list[NDArray[np.int64]]:
@@ -285,13 +287,16 @@ def true_images(test: Drive, training: Drive, tolerance_m: float, file: Path | N
     return true_images_of(test.route(), training.route(), tolerance_m)
 
 
-def kept_in(out: Path) -> str:
-    """What a Ctrl-C leaves of an experiment that keeps what it has done."""
+def resume_note(out: Path) -> str:
+    """What is said after a Ctrl-C of an experiment that keeps what it has done."""
     return f"; the same command goes on where it stopped ({out} keeps what is done)"
 
 
 def tell(document: dict[str, Any], json_file: Path | None, print_for_people: Callable[[], None]) -> None:
-    """Where `--json` is standard output, that holds nothing else; warnings go to standard error."""
+    """Report a result: JSON where it is asked for, else or beside it a print; warnings go to standard error.
+
+    Where `--json` is standard output, that holds nothing else.
+    """
     for warning in document.get("warnings", ()):
         click.echo(f"warning: {warning}", err=True)
     if json_file is not None:
@@ -301,7 +306,7 @@ def tell(document: dict[str, Any], json_file: Path | None, print_for_people: Cal
 
 
 def _print_extractors(reports: dict[str, VprReport]) -> None:
-    """One extractor a row."""
+    """Print scores, a row an extractor."""
     scores = next(iter(reports.values())).scores
     titles = (f"{relevance}: ANR / R@1 / R@5 / R@10" for relevance in scores)
     table = Table("extractor", "numbers", "bytes", "ms an image", *titles)
@@ -318,26 +323,26 @@ def _print_extractors(reports: dict[str, VprReport]) -> None:
 def _print_relevances(report: VprReport) -> None:
     table = Table("relevance", "ANR %", *(f"R@{k} %" for k in RANKS))
     for name, score in report.scores.items():
-        shown = f"{name} (default)" if name == DEFAULT_RELEVANCE.value else name
-        table.add_row(shown, f"{score.anr:.2f}", *(f"{score.recall_at[k]:.1f}" for k in RANKS))
+        label = f"{name} (default)" if name == DEFAULT_RELEVANCE.value else name
+        table.add_row(label, f"{score.anr:.2f}", *(f"{score.recall_at[k]:.1f}" for k in RANKS))
     bits = f"{report.config.n_landmarks} landmarks; index {report.index_bits_per_map_image:.1f} bits a map image"
-    within = f"true within {report.config.tolerance_m:g} m"
+    tolerance = f"true within {report.config.tolerance_m:g} m"
     print_table(
-        table, f"{_queries(report.scores)}; {within}; {bits}", *_no_second_season(report.same_route), numbers=True
+        table, f"{_queries(report.scores)}; {tolerance}; {bits}", *_no_second_season(report.same_route), numbers=True
     )
     if report.passive is not None:
         _print_passive(report.passive)
 
 
 def _print_passive(passive: PassiveScores) -> None:
-    """The belief and its rivals a row."""
+    """Print the scores of the drive in order, the belief and its rivals a row each."""
     table = Table("in order", *(f"{views} view{'s' if views > 1 else ''}: ANR / R@1" for views in WINDOWS))
     for name, scores in passive.by_window.items():
         table.add_row(name, *(f"{score.anr:.2f} / {score.recall_at[1]:.1f}" for score in scores.values()))
-    whole = passive.whole_drive
+    drive = passive.whole_drive
     print_table(
         table,
-        f"filter over the whole drive, after every view: ANR {whole.anr:.2f}, R@1 {whole.recall_at[1]:.1f}",
+        f"filter over the whole drive, after every view: ANR {drive.anr:.2f}, R@1 {drive.recall_at[1]:.1f}",
         "sums: relevances of the last views, moved along by odometry, at one or the best of five speeds; "
         "sum_brute_force_u: with nothing left out",
         numbers=True,
@@ -352,7 +357,7 @@ def _queries(scores: dict[str, RetrievalScores]) -> str:
 def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
     at_distance = document["anr_at_distance_m"]
     distances_m = next(iter(at_distance.values()))
-    views, metres, wrong = (document[f"{what}_confident"] for what in ("views_to", "metres_to", "wrong_when"))
+    views, metres, wrong = (document[f"{figure}_confident"] for figure in ("views_to", "metres_to", "wrong_when"))
     titles = ("planner", "views", "95 %", "metres", "wrong %", "ANR %", "ANR % as in the paper")
     table = Table(*titles, *(f"after {metres} m" for metres in distances_m))
     for name, anr in sorted(document["anr"].items(), key=lambda item: float(views[item[0]])):
@@ -378,7 +383,7 @@ def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
 
 
 def _print_calibration(document: dict[str, Any], same_route: SameRoute | None) -> None:
-    """Moves a row; the rest in lines below."""
+    """Print moves, a row each; other robots in lines below."""
     table = Table("moves, m", *(f"{views} views: % / m" for views in VIEWS), "wrong %")
     for move, coverage in document["coverage_95"].items():
         sizes_m = document["set_m"][move]
@@ -401,7 +406,7 @@ def _other_robots(document: dict[str, Any]) -> list[str]:
     off_route = (f"{share:.1f} {stage}" for stage, share in document["off_route"].items())
     return [
         "within 5 m of the mode, % believed: % true: "
-        + ", ".join(f"{held:.0f}: {true:.0f}" for held, true in bins if held is not None),
+        + ", ".join(f"{believed:.0f}: {true_share:.0f}" for believed, true_share in bins if believed is not None),
         f"150 views standing still: {standing['unknown']} % covered from an unknown start, {standing['tracked']} % "
         f"after 50 m, where {lost} % lost their place",
         f"carried 100 m or more: found after {carried['views_median']:.0f} views, "

@@ -65,7 +65,7 @@ from deepsimbad_client.recordings.options import (
 )
 
 Encode: TypeAlias = Callable[[Recording, Evaluator, Callable[[float], None]], Iterable[EncodedBlock] | None]
-"""Encodes a recording elsewhere, telling how far it is; None: it is encoded here."""
+"""Encodes a recording elsewhere, calling the function with the share done; None: it is to be encoded here."""
 
 
 def _actions_m(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[float, ...]:
@@ -180,25 +180,25 @@ def map_(
         record, _ = catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
         if thumbnails is not None:
             record = catalog.set_options(domain, {"thumbnails": thumbnails})
-        shown = Pictures(settings.data_dir, settings.max_pixels) if record.options.get("thumbnails") else None
-        stages = _stages(config, recordings, measure, keeps_pictures=shown is not None)
-        leaves = f"; no map was made, and the same command {after_cancel}"
-        with progress_bar(stages, f"map {domain}", leaves=leaves) as progress:
+        picture_store = Pictures(settings.data_dir, settings.max_pixels) if record.options.get("thumbnails") else None
+        stages = _stages(config, recordings, measure, keeps_pictures=picture_store is not None)
+        cancel_note = f"; no map was made, and the same command {after_cancel}"
+        with progress_bar(stages, f"map {domain}", cancel_note=cancel_note) as progress:
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
-                encoded = encode_recording(
+                encoded_recording = encode_recording(
                     *(recording, measure, settings.max_pixels, progress.update),
                     allow_missing=allow_missing,
                     blocks=encode(recording, measure, progress.update),
                 )
-                left_out[role] = encoded.left_out_names
+                left_out[role] = encoded_recording.left_out_names
                 if role in Traverse.list(catalog.data_dir, domain):
                     Traverse.delete(catalog.data_dir, domain, role)
                 with Traverse.create(catalog.data_dir, domain, role) as traverse:
-                    traverse.put_frames(encoded.drive)
-                if shown is not None and recording.encodings is None:
+                    traverse.put_frames(encoded_recording.drive)
+                if picture_store is not None and recording.encodings is None:
                     progress.stage(f"keep pictures of {role}")
-                    shown.keep(domain, _seen(recording, encoded.drive, progress.update))
+                    picture_store.keep(domain, _images_by_digest(recording, encoded_recording.drive, progress.update))
             pictures = RecordingPictures(recordings[next(iter(sources))], settings.max_pixels)
             result = remap(catalog, domain, config, measure, progress, n_threads=available_cores(), pictures=pictures)
     for role, names in left_out.items():
@@ -216,8 +216,10 @@ def map_(
         click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
 
 
-def _seen(recording: Recording, drive: Drive, on_progress: Callable[[float], None]) -> Iterator[tuple[int, bytes]]:
-    """The images of a drive's frames, by what pictures are known by."""
+def _images_by_digest(
+    recording: Recording, drive: Drive, on_progress: Callable[[float], None]
+) -> Iterator[tuple[int, bytes]]:
+    """Yield the images of a drive's frames with their digests, which pictures are kept by."""
     frames = {frame.index: frame for frame in recording.frames}
     for row, (index, digest) in enumerate(zip(drive.index.tolist(), drive.digests().tolist(), strict=True)):
         on_progress(row / drive.n_frames)
@@ -228,14 +230,14 @@ def _seen(recording: Recording, drive: Drive, on_progress: Callable[[float], Non
 def _stages(
     config: RemapConfig, recordings: Mapping[str, Recording], measure: Evaluator, *, keeps_pictures: bool
 ) -> dict[str, float]:
-    """What is to be done, with about the seconds it takes."""
+    """The stages of `deepsimbad map`, with about the seconds that they take."""
     n_frames = {role: len(recording.frames) for role, recording in recordings.items()}
-    ready = recordings["training"].encodings
-    dim = (measure.encoding_dim or 0) if ready is None else ready.shape[1]
-    reading = {f"read {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
+    encodings = recordings["training"].encodings
+    dim = (measure.encoding_dim or 0) if encodings is None else encodings.shape[1]
+    stages = {f"read {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
     if keeps_pictures:
-        reading |= {f"keep pictures of {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
-    return reading | remap_stages(
+        stages |= {f"keep pictures of {role}": n / FRAMES_A_SECOND for role, n in n_frames.items()}
+    return stages | remap_stages(
         config, n_frames["training"], n_frames.get("landmarks", 0), dim, fitting_of(measure, config.relevance)
     )
 
@@ -261,10 +263,10 @@ def localize(domain: str, images: tuple[str, ...], rotate: int | None, as_json: 
         evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
         snapshot, answers = active.snapshot, list[tuple[str, Any]]()
         levels = levels_in(snapshot.landmark_model)
-        for name, given in views(images, evaluator.forms, evaluator.input_size, levels, rotate):
+        for name, observation in views(images, evaluator.forms, evaluator.input_size, levels, rotate):
             watch = Stopwatch()
             try:
-                view, remarks = _view_in(given, evaluator, snapshot, settings.max_pixels)
+                view, remarks = _view_in(observation, evaluator, snapshot, settings.max_pixels)
                 watch.lap("decode")
                 localization = localize_view(snapshot, evaluator, view, watch=watch)
             except DeepSimbadError as error:
@@ -277,19 +279,19 @@ def localize(domain: str, images: tuple[str, ...], rotate: int | None, as_json: 
     for name, answer in answers:
         belief = answer["belief"]
         mean, (low, high) = f"{belief['mean_m']:.1f} +- {belief['std_m']:.1f} m", belief["credible_95_m"]
-        within = f"{low:.1f} .. {high:.1f} m"
+        interval = f"{low:.1f} .. {high:.1f} m"
         frame = belief["top"][0]["frame"] or f"image {belief['top'][0]['map_image']}"
-        table.add_row(name, frame, f"{belief['mode_m']:.1f} m", mean, within, f"{belief['entropy_bits']:.1f} bit")
+        table.add_row(name, frame, f"{belief['mode_m']:.1f} m", mean, interval, f"{belief['entropy_bits']:.1f} bit")
     print_table(table)
 
 
 def _view_in(
-    given: Mapping[str, Any], evaluator: Evaluator, snapshot: Map, max_pixels: int
+    observation: Mapping[str, Any], evaluator: Evaluator, snapshot: Map, max_pixels: int
 ) -> tuple[View, Sequence[str]]:
-    """A view as the engine takes it, and what a person should know of it."""
-    if "encoding" in given:
-        return ReadyEncoding(np.asarray(given["encoding"], np.float64)), ()
-    body, media_type = given["image"], given["content_type"]
+    """A view as the engine takes it, and remarks on it for people."""
+    if "encoding" in observation:
+        return ReadyEncoding(np.asarray(observation["encoding"], np.float64)), ()
+    body, media_type = observation["image"], observation["content_type"]
     if media_type in MEDIA_TYPES:
         levels = levels_in(snapshot.landmark_model)
         decoded = Decoded.of(ImageFile.read(body, max_pixels), body, evaluator, levels, snapshot.cameras)

@@ -14,7 +14,14 @@ from typing import Any
 import click
 from rich.table import Table
 
-from deepsimbad.cli.experiment import DEFAULT_TOLERANCE_M, experiment, json_file_option, kept_in, tell, tolerance_option
+from deepsimbad.cli.experiment import (
+    DEFAULT_TOLERANCE_M,
+    experiment,
+    json_file_option,
+    resume_note,
+    tell,
+    tolerance_option,
+)
 from deepsimbad.cli.local import seed_option, training_episodes_option
 from deepsimbad.cli.paper_page import write_report
 from deepsimbad.cli.terminal import (
@@ -81,7 +88,7 @@ def paper(
     tolerance: float | None,
     reading: dict[str, Any],
     json_file: Path | None,
-    **asked: Any,
+    **options: Any,
 ) -> None:
     """The paper's section III: eight triplets of four drives, figures 5 to 7, and what is better.
 
@@ -92,30 +99,31 @@ def paper(
     settings = given_settings()
     first_m = DEFAULT_TOLERANCE_M if tolerance is None else tolerance
     config = PaperConfig(
-        tolerances_m=tuple(sorted({first_m, 5.0, 10.0, 25.0}, key=lambda m: (m != first_m, m))), **asked
+        tolerances_m=tuple(sorted({first_m, 5.0, 10.0, 25.0}, key=lambda m: (m != first_m, m))), **options
     )
     measure = make_evaluator(evaluator, settings.compute())
-    recordings, missing = _opened(root, config.nbv().episode_m, reading)
+    recordings, missing = _open_drives(root, config.nbv().episode_m, reading)
     triplets = runnable(recordings)
     if not triplets:
         raise InvalidSourceError(
-            f"{root} has the drives of no triplet: {'; '.join(f'{season}: {why}' for season, why in missing.items())}"
+            f"{root} has the drives of no triplet: "
+            + "; ".join(f"{season}: {reason}" for season, reason in missing.items())
         )
     n_frames = {season: len(recording.frames) for season, recording in recordings.items()}
-    encode_s = sum(_ENCODE_S * n_frames[each] for each, drive in recordings.items() if drive.encodings is None)
+    encode_s = sum(_ENCODE_S * n_frames[season] for season, drive in recordings.items() if drive.encodings is None)
     measure_s = sum(seconds_to_measure(config, n_frames).values())
     not_run = ["-".join(triplet) for triplet in TRIPLETS if triplet not in triplets]
     _tell_plan(recordings, missing, not_run, (encode_s + measure_s) / available_cores(), out)
-    made_of = {"weights": measure.weights_sha256, **evaluator.as_dict(), **reading}
+    ingredients = {"weights": measure.weights_sha256, **evaluator.as_dict(), **reading}
     stages = {"encode": encode_s + 1, "measure": measure_s, "write": 2.0}
-    with progress_bar(stages, "paper", leaves=kept_in(out)) as progress:
+    with progress_bar(stages, "paper", cancel_note=resume_note(out)) as progress:
         progress.stage("encode")
-        encoded = _encoded(recordings, measure, settings.max_pixels, out, made_of, progress.update)
-        drives = {season: each.drive for season, each in encoded.items()}
+        encoded_drives = _encode_drives(recordings, measure, settings.max_pixels, out, ingredients, progress.update)
+        drives = {season: encoded_drive.drive for season, encoded_drive in encoded_drives.items()}
         progress.stage("measure")
         results = measure_paper(
             *(config, measure, drives, out / "results", {"evaluator": evaluator.as_dict()}),
-            _telling(progress.update),
+            _with_log(progress.update),
             {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
         )
         progress.stage("write")
@@ -127,8 +135,8 @@ def paper(
                     "date": SEASONS[season],
                     "n_frames": drive.n_frames,
                     "length_m": float(drive.position_m[-1] - drive.position_m[0]),
-                    "left_out": encoded[season].left_out,
-                    "encode_ms": encoded[season].encode_ms,
+                    "left_out": encoded_drives[season].left_out,
+                    "encode_ms": encoded_drives[season].encode_ms,
                     "trajectory": _trajectory(drive),
                 }
                 for season, drive in drives.items()
@@ -150,27 +158,27 @@ def paper(
     tell(document, json_file, lambda: _print(document))
 
 
-def _telling(update: Callable[[float], None]) -> Callable[[str, float], None]:
-    """Tells a log how far it is, and what is left, every tenth; a terminal has its bar."""
-    began_s, told = time.monotonic(), [0]
+def _with_log(update: Callable[[float], None]) -> Callable[[str, float], None]:
+    """A function that updates a bar and, where there is no terminal for one, logs every tenth and the time left."""
+    started_s, last_tenth = time.monotonic(), [0]
 
     def tell(name: str, share: float) -> None:
         update(share)
         tenth = int(10 * share)
-        if tenth > told[0] and not sys.stderr.isatty():
-            told[0] = tenth
-            left_s = (time.monotonic() - began_s) * (1 - share) / share
+        if tenth > last_tenth[0] and not sys.stderr.isatty():
+            last_tenth[0] = tenth
+            left_s = (time.monotonic() - started_s) * (1 - share) / share
             click.echo(f"{share:.0%} measured, at {name}; about {left_s / 60:.0f} minutes left", err=True)
 
     return tell
 
 
-def _opened(root: Path, least_m: float, reading: Mapping[str, Any]) -> tuple[dict[str, Recording], dict[str, str]]:
-    """The drives that are there and long enough, and why others are not."""
+def _open_drives(root: Path, least_m: float, reading: Mapping[str, Any]) -> tuple[dict[str, Recording], dict[str, str]]:
+    """The drives by season that are there and long enough, and why others are not."""
     recordings, missing = dict[str, Recording](), dict[str, str]()
     for season, date in SEASONS.items():
-        ready = (root / f"{date}{suffix}" for suffix in sorted(ENCODING_SUFFIXES, reverse=True))
-        source = next((str(file) for file in ready if file.is_file()), f"{NCLT_PREFIX}{root / date}")
+        files = (root / f"{date}{suffix}" for suffix in sorted(ENCODING_SUFFIXES, reverse=True))
+        source = next((str(file) for file in files if file.is_file()), f"{NCLT_PREFIX}{root / date}")
         try:
             drive = open_recording(source, **reading)
         except SourceError as error:
@@ -187,54 +195,56 @@ def _opened(root: Path, least_m: float, reading: Mapping[str, Any]) -> tuple[dic
 def _tell_plan(
     recordings: Mapping[str, Recording], missing: Mapping[str, str], not_run: list[str], seconds: float, out: Path
 ) -> None:
-    """What will be done, on standard error."""
+    """Print what will be done, on standard error."""
     for season, recording in recordings.items():
         length_m = recording.frames[-1].position_m - recording.frames[0].position_m
         click.echo(f"{season} {SEASONS[season]}: {len(recording.frames)} frames, {length_m:.0f} m", err=True)
-    for season, why in missing.items():
-        click.echo(f"{season} is missing: {why}", err=True)
-    run = ", ".join("-".join(triplet) for triplet in runnable(recordings))
-    click.echo(f"landmark-training-test: {run}" + (f"; not run: {', '.join(not_run)}" if not_run else ""), err=True)
+    for season, reason in missing.items():
+        click.echo(f"{season} is missing: {reason}", err=True)
+    triplets = ", ".join("-".join(triplet) for triplet in runnable(recordings))
+    click.echo(
+        f"landmark-training-test: {triplets}" + (f"; not run: {', '.join(not_run)}" if not_run else ""), err=True
+    )
     minutes = f"{max(seconds / 60, 1):.0f} min" if seconds < 5400 else f"{seconds / 3600:.0f} h"
     click.echo(f"about {minutes} on {available_cores()} cores, less what {out} keeps of earlier runs", err=True)
 
 
-def _encoded(
+def _encode_drives(
     recordings: Mapping[str, Recording],
     evaluator: Evaluator,
     max_pixels: int,
     out: Path,
-    made_of: Mapping[str, Any],
+    ingredients: Mapping[str, Any],
     on_progress: Callable[[float], None],
 ) -> dict[str, EncodedRecording]:
-    """Every drive, some at once."""
+    """Encode every drive, several at once."""
     shares = Shares(
-        lambda _, share: on_progress(share), {each: len(drive.frames) for each, drive in recordings.items()}
+        lambda _, share: on_progress(share), {season: len(drive.frames) for season, drive in recordings.items()}
     )
-    results, encoded = ResultCache(out / "results", made_of), dict[str, EncodedRecording]()
+    results, encoded_drives = ResultCache(out / "results", ingredients), dict[str, EncodedRecording]()
 
     def encode(season: str) -> None:
         report, date = shares.report(season), SEASONS[season]
-        with open_encoding_cache(out / "encodings", date, source=date, **made_of) as kept:
-            drive = encode_recording(recordings[season], evaluator, max_pixels, report, encoding_cache=kept)
-        of_drive = drive_digest(drive.drive)
-        took = results.get(f"{season}-encode", lambda: {"ms": drive.encode_ms}, digest=of_drive)  # of who encoded it
-        encoded[season] = replace(drive, encode_ms=took["ms"])
+        with open_encoding_cache(out / "encodings", date, source=date, **ingredients) as encodings:
+            drive = encode_recording(recordings[season], evaluator, max_pixels, report, encoding_cache=encodings)
+        digest = drive_digest(drive.drive)
+        timing = results.get(f"{season}-encode", lambda: {"ms": drive.encode_ms}, digest=digest)  # of who encoded it
+        encoded_drives[season] = replace(drive, encode_ms=timing["ms"])
         report(1.0)
 
     in_threads([partial(encode, season) for season in recordings])
-    return {season: encoded[season] for season in recordings}
+    return {season: encoded_drives[season] for season in recordings}
 
 
 def _trajectory(drive: Drive) -> list[list[float]]:
-    """Points [x, y] along it; none where it does not know them."""
+    """Points [x, y] along a drive; none where it does not know them."""
     step = -(-drive.n_frames // _MOST_POINTS)
     points = zip(drive.x_m[::step].tolist(), drive.y_m[::step].tolist(), strict=True)
     return [[x, y] for x, y in points if math.isfinite(x) and math.isfinite(y)]
 
 
 def machine() -> str:
-    """What it runs on, without its name."""
+    """The processor, the cores and the Python that this runs on."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     model = next(
@@ -248,15 +258,15 @@ def _print(document: dict[str, Any]) -> None:
     table = Table("ANR %, h =", *lengths)
     for name in document["methods"]:
         cells = (document["anr"][length].get(name) for length in lengths)
-        table.add_row(name, *("" if each is None else f"{each['mean']:.2f}" for each in cells))
+        table.add_row(name, *("" if figure is None else f"{figure['mean']:.2f}" for figure in cells))
     bits = document["index_bits_per_map_image"]["rrf"]
     print_table(
         table,
         f"{len(document['by_triplet'])} triplets, {document['n_queries']} queries, {document['n_left_out']} left out; "
         f"rrf at h = {h}: {bits:.1f} bits a map image",
         *(
-            f"{each['verdict']}: {each['claim']} ({each['n_agree']} of {each['n_triplets']} triplets)"
-            for each in document["claims"]
+            f"{claim['verdict']}: {claim['claim']} ({claim['n_agree']} of {claim['n_triplets']} triplets)"
+            for claim in document["claims"]
         ),
         f"page: {document['files'][0]}",
         numbers=True,

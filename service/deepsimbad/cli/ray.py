@@ -41,7 +41,7 @@ def _required() -> None:
 @_address_option
 @click.pass_context
 def map_on_ray(
-    context: click.Context, /, domain: str, evaluator: EvaluatorConfig, address: str | None, **told: Any
+    context: click.Context, /, domain: str, evaluator: EvaluatorConfig, address: str | None, **options: Any
 ) -> None:
     """Make the map that `deepsimbad map` would, byte for byte but for its time, while a cluster encodes.
 
@@ -54,14 +54,14 @@ def map_on_ray(
 
     settings = given_settings()
     folder = domain_folder(settings.data_dir, domain) / "encoding"
-    copied, copies = (settings.data_dir / "copied-drives").resolve(), dict[Path, StoredDrive]()
+    copies_folder, copies = (settings.data_dir / "copied-drives").resolve(), dict[Path, StoredDrive]()
     for role in ("landmarks", "training"):
-        if told[role] is not None and (stored := stored_drive(told[role], copied)) is not None:
-            drive, part = stored
+        if options[role] is not None and (drive_and_part := stored_drive(options[role], copies_folder)) is not None:
+            drive, part = drive_and_part
             with progress_bar({"fetch": 1.0}, f"fetch {drive.url}") as progress:
                 progress.stage("fetch")
                 drive.copy(progress.update)
-            told[role], copies[drive.folder] = f"{drive.folder}{part}", drive
+            options[role], copies[drive.folder] = f"{drive.folder}{part}", drive
 
     def encode(
         recording: Recording, measure: Evaluator, on_progress: Callable[[float], None]
@@ -71,13 +71,13 @@ def map_on_ray(
         join_cluster(address)
         if isinstance(recording, FolderRecording) and recording.folder in copies:
             recording = copies[recording.folder].of(recording)
-        given = (recording, measure, dict(evaluator.as_dict()), settings.compute(), settings.max_pixels)
-        return cluster_blocks(*given, folder, on_progress)
+        arguments = (recording, measure, dict(evaluator.as_dict()), settings.compute(), settings.max_pixels)
+        return cluster_blocks(*arguments, folder, on_progress)
 
-    goes_on = "goes on where it stopped"
-    context.invoke(map_, encode=encode, after_cancel=goes_on, domain=domain, evaluator=evaluator, **told)
-    for done in (folder, *copies):
-        shutil.rmtree(done, ignore_errors=True)
+    after_cancel = "goes on where it stopped"
+    context.invoke(map_, encode=encode, after_cancel=after_cancel, domain=domain, evaluator=evaluator, **options)
+    for path in (folder, *copies):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 @ray.command()
@@ -124,8 +124,8 @@ def serve(
 
     os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
     join_cluster(address)
-    of_networks = application.Encoders(encoders, encoder_gpus)
-    fleet = application.build(settings, replicas, encoders=of_networks, n_administrators=administrators)
+    encoder_processes = application.Encoders(encoders, encoder_gpus)
+    fleet = application.build(settings, replicas, encoders=encoder_processes, n_administrators=administrators)
     front = application.start(fleet)
     click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
     application.wait()

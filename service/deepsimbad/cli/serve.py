@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 def address_options(command: Command) -> Command:
-    """Where a command that serves listens."""
+    """The options of where a command that serves listens."""
     host = click.option("--host", help="Address to listen on.  [default: $DEEPSIMBAD_HOST, else 127.0.0.1]")
     port = click.option(
         "--port", type=int, help="Port to listen on; 0 takes a free one.  [default: $DEEPSIMBAD_PORT, else 8000]"
@@ -99,11 +99,11 @@ def settings(as_json: bool, host: str | None, port: int | None) -> None:
     table = Table("setting", "value", "from")
     for name, value in values.items():
         origin = traced.origins[name]
-        table.add_row(name, escape(shown(value)), escape(str(traced.file) if origin == "file" else origin))
+        table.add_row(name, escape(setting_text(value)), escape(str(traced.file) if origin == "file" else origin))
     print_table(table)
 
 
-def shown(value: Any) -> str:
+def setting_text(value: Any) -> str:
     """A setting's value as it is written in the environment; `none` where there is none."""
     if value is None or isinstance(value, bool):
         return str(value).lower()
@@ -147,9 +147,11 @@ def create(scope: str, name: str, expires_days: float | None, domains: tuple[str
             catalog.revoke_key(record.key_id)
             click.echo(f"key {record.key_id} could not be written, and is revoked", err=True)
             raise
-    until = "" if record.expires_at is None else f" until {record.expires_at}"
-    where = f" of {', '.join(domains)}" if domains else ""
-    click.echo(f"key {record.key_id} opens {scope}{where}{until}; keep it now, it cannot be shown again", err=True)
+    expiry = "" if record.expires_at is None else f" until {record.expires_at}"
+    scope_domains = f" of {', '.join(domains)}" if domains else ""
+    click.echo(
+        f"key {record.key_id} opens {scope}{scope_domains}{expiry}; keep it now, it cannot be shown again", err=True
+    )
     if is_first:
         click.echo("it is the first: from now on every call under /v1 asks for a key", err=True)
 
@@ -167,11 +169,11 @@ def list_(as_json: bool) -> None:
     else:
         click.echo(f"nothing was ever kept in {folder}: if keys were, name their folder with --data-dir", err=True)
     if as_json:
-        write_json([_described(record) for record in records])
+        write_json([_key_document(record) for record in records])
         return
     table = Table("key", "name", "scope", "domains", "state", "created", "expires", "revoked")
     for record in records:
-        cells = {**_described(record), "domains": "all" if record.domains is None else ", ".join(record.domains)}
+        cells = {**_key_document(record), "domains": "all" if record.domains is None else ", ".join(record.domains)}
         table.add_row(*("-" if value is None else escape(value) for value in cells.values()))
     print_table(table)
 
@@ -182,19 +184,19 @@ def list_(as_json: bool) -> None:
 @data_dir_option
 def revoke(key_id: str, as_json: bool) -> None:
     """Let a key open nothing any more. KEY_ID is what `keys list` shows; a whole key, a leaked one say, does too."""
-    whole = ApiKey.parse(key_id)
+    api_key = ApiKey.parse(key_id)
     folder = given_settings().data_dir
     if not catalog_path(folder).is_file():
         raise UnknownKeyError(f"there are no keys in {folder}: name their folder with --data-dir")
     with Catalog.open(folder) as catalog:
-        record = catalog.revoke_key(key_id if whole is None else whole.key_id)
+        record = catalog.revoke_key(key_id if api_key is None else api_key.key_id)
         records = catalog.keys()
-    report(as_json, _described(record), f"key {record.key_id} is revoked")
-    if not any(other.is_usable(current_moment()) for other in records):
+    report(as_json, _key_document(record), f"key {record.key_id} is revoked")
+    if not any(left_record.is_usable(current_moment()) for left_record in records):
         click.echo("no usable key is left: the service stays closed until one is created", err=True)
 
 
-def _described(record: KeyRecord) -> dict[str, Any]:
+def _key_document(record: KeyRecord) -> dict[str, Any]:
     state = "usable" if record.is_usable(current_moment()) else "expired"
     return {
         "key_id": record.key_id,

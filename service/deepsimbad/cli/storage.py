@@ -37,9 +37,11 @@ def backup(file: Path, as_json: bool) -> None:
     source = existing_data_dir()
     with progress_bar({"copy": 1.0}, "backup") as progress:
         progress.stage("copy")
-        backed_up = back_up(source, file, release(), progress.update)
-    counts = f"{backed_up.n_domains} domains, {backed_up.n_maps} maps, {backed_up.n_traverses} traverses"
-    report(as_json, asdict(backed_up), f"{file}: {counts}, {backed_up.bytes} bytes, sha256 {backed_up.sha256}")
+        backup_report = back_up(source, file, release(), progress.update)
+    counts = f"{backup_report.n_domains} domains, {backup_report.n_maps} maps, {backup_report.n_traverses} traverses"
+    report(
+        as_json, asdict(backup_report), f"{file}: {counts}, {backup_report.bytes} bytes, sha256 {backup_report.sha256}"
+    )
 
 
 @click.command()
@@ -51,9 +53,10 @@ def restore(file: Path, as_json: bool) -> None:
     target = given_settings().data_dir
     with progress_bar({"unpack": 1.0}, "restore") as progress:
         progress.stage("unpack")
-        restored = restore_backup(file, target, progress.update)
-    line = f"{restored.data_dir}: {restored.n_files} files, {restored.bytes} bytes, as of {restored.created_at}"
-    report(as_json, asdict(restored), line)
+        restore_report = restore_backup(file, target, progress.update)
+    counts = f"{restore_report.n_files} files, {restore_report.bytes} bytes"
+    line = f"{restore_report.data_dir}: {counts}, as of {restore_report.created_at}"
+    report(as_json, asdict(restore_report), line)
 
 
 @click.command()
@@ -66,16 +69,16 @@ def export(domain: str, file: Path, version: int | None, as_json: bool) -> None:
     """Copy a sealed map of DOMAIN into FILE, byte for byte, checked against its digest."""
     existing_data_dir()
     with open_given_catalog() as catalog:
-        exported = export_map(catalog, domain, version, file)
-    n_bytes, digest = exported.file_bytes, exported.sha256
+        record = export_map(catalog, domain, version, file)
+    n_bytes, digest = record.file_bytes, record.sha256
     document = {
         "domain": domain,
-        "map_version": exported.version,
+        "map_version": record.version,
         "file": str(file),
         "bytes": n_bytes,
         "sha256": digest,
     }
-    report(as_json, document, f"map {exported.version} of {domain} is in {file}: {n_bytes} bytes, sha256 {digest}")
+    report(as_json, document, f"map {record.version} of {domain} is in {file}: {n_bytes} bytes, sha256 {digest}")
 
 
 @click.command("import")
@@ -92,10 +95,10 @@ def import_(file: Path, domain: str | None, sha256: str | None, activate: bool, 
     The domain is made where it is absent; else it must have the same evaluator, actions and kind of route.
     """
     with open_given_catalog() as catalog:
-        imported = import_map(catalog, file, domain, sha256, activate=activate)
-    state = "active" if imported.active else "sealed"
-    line = f"map {imported.map_version} of {imported.domain} is {state}: {imported.bytes} bytes"
-    report(as_json, asdict(imported), line)
+        import_report = import_map(catalog, file, domain, sha256, activate=activate)
+    state = "active" if import_report.active else "sealed"
+    line = f"map {import_report.map_version} of {import_report.domain} is {state}: {import_report.bytes} bytes"
+    report(as_json, asdict(import_report), line)
 
 
 @click.command()
@@ -113,16 +116,18 @@ def check(context: click.Context, objects: bool, as_json: bool) -> None:
         raise UnavailableError(f"there is nothing to check in {folder}: name its folder with --data-dir")
     with progress_bar({"read": 1.0, "objects": 1.0 * objects}, "check") as progress:
         progress.stage("read")
-        seen = inspect(folder, progress.update)
+        inspection = inspect(folder, progress.update)
         if objects:
             progress.stage("objects")
-            in_store = inspect_objects(folder, progress.update)
-            seen = Inspection(seen.n_files + in_store.n_files, seen.damaged + in_store.damaged)
+            store_inspection = inspect_objects(folder, progress.update)
+            inspection = Inspection(
+                inspection.n_files + store_inspection.n_files, inspection.damaged + store_inspection.damaged
+            )
     if as_json:
-        write_json({"ok": not seen.damaged, **asdict(seen)})
+        write_json({"ok": not inspection.damaged, **asdict(inspection)})
     else:
-        for finding in seen.damaged:
+        for finding in inspection.damaged:
             click.echo(f"damaged: {finding.file}: {finding.what}")
-        click.echo(f"{seen.n_files} files read, {len(seen.damaged)} problems", err=True)
-    if seen.damaged:
+        click.echo(f"{inspection.n_files} files read, {len(inspection.damaged)} problems", err=True)
+    if inspection.damaged:
         context.exit(1)

