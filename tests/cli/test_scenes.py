@@ -1,4 +1,4 @@
-"""Recordings with scenes beside their pictures: every command takes them, by each evaluator that wants more than pixels."""
+"""Recordings with scenes beside their pictures, which every command takes, by each evaluator of scenes or of both."""
 
 import json
 from importlib.util import find_spec
