@@ -118,7 +118,7 @@ def test_a_deleted_domain_takes_its_series_along(client, domain):
     client.post(f"/v1/domains/{domain}/localizations", json=RANKS)
     assert any(f'domain="{domain}"' in name for name in scrape(client))
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
-    client.services.metrics.localized(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
+    client.services.metrics.record_localization(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
     assert not [name for name in scrape(client) if f'domain="{domain}"' in name]
 
 

@@ -30,10 +30,10 @@ def metrics(tmp_path_factory):
         assert client.put("/v1/admin/domains/d", json=body).status_code == 201
         client.post("/v1/sessions/nobody/observations", json={"ranked_landmarks": [1]})
         metrics = client.app.state.services.metrics
-        metrics.localized("d", {"plan": 1.0}, 3.0)
-        metrics.fed_back("d", [0.5])
-        metrics.refused("rate_limited")
-        metrics.job_ended("remap", "failed", 1.0)
+        metrics.record_localization("d", {"plan": 1.0}, 3.0)
+        metrics.record_truths("d", [0.5])
+        metrics.count_refusal("rate_limited")
+        metrics.record_job("remap", "failed", 1.0)
         return client.get("/metrics").text
 
 

@@ -250,7 +250,7 @@ def _start(
     worker = InferenceWorker(max_waiting=settings.max_queue, longest_wait_s=settings.encode_wait_ms / 1000)
     parts.callback(worker.close)
     worker.submit(warm_up).result()
-    store = parts.enter_context(substitutes.sessions(settings.data_dir, metrics.committed))
+    store = parts.enter_context(substitutes.sessions(settings.data_dir, metrics.record_commit))
     live_sessions = Sessions(
         store,
         maps_,
@@ -280,7 +280,7 @@ def _start(
         except DeepSimbadError:
             log.exception("a new map cannot be served", extra={"domain": domain})
 
-    runner = JobRunner(catalog, run_job, serve_new_map, settings.max_jobs, metrics.job_ended)
+    runner = JobRunner(catalog, run_job, serve_new_map, settings.max_jobs, metrics.record_job)
     parts.callback(runner.close)
     threads = {
         "the inference worker": lambda: worker.is_alive,

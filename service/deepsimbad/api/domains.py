@@ -23,7 +23,7 @@ from deepsimbad.api.requests import (
     Page,
     RunningServices,
     StrictRoute,
-    names,
+    has_tag,
     page_of,
     read_json,
 )
@@ -242,7 +242,7 @@ async def get_landmark_model(
         else:
             snapshot = services.maps.snapshot(domain, map_version)
         etag = f'"{snapshot.landmark_model_digest}"'
-        is_known = names(request.headers.get("if-none-match"), etag)
+        is_known = has_tag(request.headers.get("if-none-match"), etag)
         return etag, None if is_known else snapshot.portable_landmarks()
 
     etag, content = await run_sync(pack, limiter=services.long_work)

@@ -105,7 +105,7 @@ class Door:
         if root and scope["path"].startswith(f"{root}/"):  # a proxy may give it on or take it away
             scope["path"] = scope["path"].removeprefix(root)
         request = scope["door"] = _Request(self, scope, receive, send)
-        self.metrics.request_began()
+        self.metrics.begin_request()
         try:
             await self._app(scope, request.receive, request.send)
         except asyncio.CancelledError:  # the server stops and waits no longer
@@ -255,13 +255,13 @@ class _Request:
         # Labels come from our own words alone: a stranger's paths would grow the registry without end.
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
-        metrics.request_ended(method, route, self.status, seconds)
+        metrics.end_request(method, route, self.status, seconds)
         state, log_fields = scope["state"] | (scope.get("path_params") or {}), {}
         for name in _LOG_FIELDS:
             if name in state:
                 log_fields[name] = state[name]
         if log_fields.get("code") in REFUSALS:
-            metrics.refused(log_fields.get("limit", log_fields["code"]))
+            metrics.count_refusal(log_fields.get("limit", log_fields["code"]))
         if log.isEnabledFor(logging.INFO):
             line = {
                 "request_id": scope["state"]["request_id"],

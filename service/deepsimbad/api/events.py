@@ -10,8 +10,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from deepsimbad.api.jobs import room_for_a_stream
 from deepsimbad.api.problems import problems
 from deepsimbad.api.requests import GREATEST_ID, RunningServices, SessionId, StrictRoute, key_id_of, robot_of
-from deepsimbad.api.sessions import SessionAnswer, render_observation, render_session
-from deepsimbad.engine.session import SessionView
+from deepsimbad.api.sessions import render_observation, render_session
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.store.sessions import SessionRecord
 
@@ -29,10 +28,6 @@ async def _followable_session(
     """The session of the path, so that one whose map is no more is refused before a stream begins."""
     await run_sync(services.sessions.engine_of, session)
     return session
-
-
-def _observation_answer(view: SessionView) -> SessionAnswer:
-    return render_observation(view, Stopwatch())
 
 
 @router.get(
@@ -77,9 +72,11 @@ async def get_session_events(
             return
         if event is None:
             continue
-        render = _observation_answer if event.is_observation else render_session
-        name = "observation" if event.is_observation else "prior"
-        yield ServerSentEvent(data=render(event.view), event=name, id=str(event.sequence))
+        number = str(event.sequence)
+        if event.is_observation:
+            yield ServerSentEvent(data=render_observation(event.view, Stopwatch()), event="observation", id=number)
+        else:
+            yield ServerSentEvent(data=render_session(event.view), event="prior", id=number)
     yield ServerSentEvent(data={"session_id": session.session_id}, event="done")
 
 

@@ -240,7 +240,7 @@ async def post_experience(
         finally:  # what was kept counts now or never, though the job be refused
             try:
                 ranking = await services.truths.rank(body.session_id, body.true_positions_m)
-                await run_sync(services.metrics.fed_back, domain, ranking.new_since(before_m).tolist())
+                await run_sync(services.metrics.record_truths, domain, ranking.new_since(before_m).tolist())
             except DeepSimbadError as error:  # the job is on its way all the same
                 labels = {"domain": domain, "session_id": body.session_id}
                 log.warning("truths could not be ranked: %s", error, extra=labels)

@@ -352,7 +352,7 @@ async def post_localization(
     answer, body = await services.render_json(
         localization.belief.top.size, render_localization, localization, watch, remarks
     )
-    services.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
+    services.metrics.record_localization(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
     return Response(body, media_type=JSON)
 
 

@@ -25,7 +25,7 @@ from deepsimbad.api.requests import (
     Page,
     RunningServices,
     StrictRoute,
-    names,
+    has_tag,
     page_of,
     read_json,
 )
@@ -157,7 +157,7 @@ async def get_map_file(
 
     path, sha256, n_bytes = await run_sync(check)
     etag = f'"sha256:{sha256}"'
-    if names(request.headers.get("if-none-match"), etag):
+    if has_tag(request.headers.get("if-none-match"), etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**REVALIDATE, "ETag": etag})
     request.scope["headers"] = one_range(request.scope["headers"], n_bytes)
     repr_digest = base64.b64encode(bytes.fromhex(sha256)).decode()

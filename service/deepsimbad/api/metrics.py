@@ -51,8 +51,8 @@ class Metrics:
     """The service's counters, all named `deepsimbad_...`.
 
     Attributes:
-        request_began: Call it as a request's answer begins.
-        committed: Call it with the number of writes in one transaction of the sessions' file.
+        begin_request: Call it as a request's answer begins.
+        record_commit: Call it with the number of writes in one transaction of the sessions' file.
         map_store_failing: Call it with whether the map store cannot be followed now.
     """
 
@@ -81,7 +81,7 @@ class Metrics:
         meaning = "Observations of sessions: accepted, repeated (counted before), or the code of what was wrong."
         self._observations = counter("observations", meaning, "outcome")
         meaning = "Writes that shared one transaction of the sessions' file."
-        self.committed = histogram("session_commit_writes", meaning, _BATCH_BUCKETS).observe
+        self.record_commit = histogram("session_commit_writes", meaning, _BATCH_BUCKETS).observe
         meaning = "Requests turned away for what they are or how many, by reason."
         self._refused = counter("refused_requests", meaning, "reason")
         meaning = "Time from a job's start to its end."
@@ -89,7 +89,7 @@ class Metrics:
         self._in_flight = Gauge(
             "deepsimbad_requests_in_flight", "Requests being answered now.", registry=self._registry
         )
-        self.request_began = self._in_flight.inc
+        self.begin_request = self._in_flight.inc
         meaning = "1 where the map store could not be followed the last time."
         self.map_store_failing = Gauge("deepsimbad_map_store_failing", meaning, registry=self._registry).set
         ProcessCollector(registry=self._registry)
@@ -102,16 +102,16 @@ class Metrics:
         self._state = state
         self._registry.register(state)
 
-    def request_ended(self, method: str, route: str, status: int, seconds: float) -> None:
+    def end_request(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request as answered."""
         self._in_flight.dec()
         self._requests(method, route, str(status)).inc()
         self._request_seconds(route).observe(seconds)
 
-    def localized(
+    def record_localization(
         self, domain: str, timings_ms: Mapping[str, float], entropy_bits: float, outcome: str | None = None
     ) -> None:
-        """Record one answer to a view; for a session's view with its outcome, as `observed` takes it."""
+        """Record one answer to a view; for a session's view with its outcome, as `count_observation` takes it."""
         if outcome is not None:
             self._observations.labels(outcome).inc()
         for stage, milliseconds in timings_ms.items():
@@ -119,22 +119,22 @@ class Metrics:
         self._domains.add(domain)
         self._entropy_bits.labels(domain).observe(entropy_bits)
 
-    def fed_back(self, domain: str, rank_shares: Iterable[float]) -> None:
+    def record_truths(self, domain: str, rank_shares: Iterable[float]) -> None:
         """Record the ranks of the truth in beliefs, as shares of the map, 0..1, one for every observation."""
         self._domains.add(domain)
         ranks = self._live_anr_percent.labels(domain)
         for share in rank_shares:
             ranks.observe(100 * share)
 
-    def observed(self, outcome: str) -> None:
+    def count_observation(self, outcome: str) -> None:
         """Count an observation of a session: "accepted", "repeated" or an error's code."""
         self._observations.labels(outcome).inc()
 
-    def refused(self, reason: str) -> None:
+    def count_refusal(self, reason: str) -> None:
         """Count a request turned away; `reason` is the error's code, or the setting whose limit was met."""
         self._refused.labels(reason).inc()
 
-    def job_ended(self, kind: str, state: str, seconds: float) -> None:
+    def record_job(self, kind: str, state: str, seconds: float) -> None:
         """Record how long a job ran until it ended in this state."""
         self._job_seconds.labels(kind, state).observe(seconds)
 

@@ -319,8 +319,8 @@ LandmarkModelTag = Annotated[
 ]
 
 
-def names(header: str | None, etag: str) -> bool:
-    """Whether an If-None-Match names this content; weak tags do."""
+def has_tag(header: str | None, etag: str) -> bool:
+    """Whether an If-None-Match names a content by its tag; weak tags count too."""
     return header is not None and any(tag.strip().removeprefix("W/") in {etag, "*"} for tag in header.split(","))
 
 

@@ -311,14 +311,14 @@ async def post_observation(
         observation = Observation(decode, action_m, action_std_m, shortlist, idempotency, landmark_models)
         view = await services.sessions.observe(session_id, observation, watch, robot_of(request))
     except DeepSimbadError as error:
-        services.metrics.observed(error.code)
+        services.metrics.count_observation(error.code)
         raise
     if media_type in MEDIA_TYPES and await _keeps_pictures(services, view.snapshot.domain):
         services.pictures.hold_view(session_id, body)
     answer, body = await services.render_json(view.belief.top.size, render_observation, view, watch)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
-    services.metrics.localized(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
+    services.metrics.record_localization(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)
     return Response(body, media_type=JSON)
 
 
@@ -400,7 +400,7 @@ async def post_truths(session_id: SessionId, request: Request, services: Running
     ranking, before_m = await services.truths.keep(
         session_id, body.true_positions_m, body.true_map_images, body.first_observation, robot_of(request)
     )
-    await run_sync(services.metrics.fed_back, ranking.session.domain, ranking.new_since(before_m).tolist())
+    await run_sync(services.metrics.record_truths, ranking.session.domain, ranking.new_since(before_m).tolist())
     ranks = None if ranking.retrieval_rank is None else ranking.retrieval_rank[ranking.first :].tolist()
     return TruthsAnswer(
         n_scored=ranking.n_scored,
