@@ -58,7 +58,7 @@ class Drive:
     y_m: NDArray[np.float64] | None = None
 
     def part(self, first: int, stop: int) -> "Drive":
-        """Some of its frames, which keep their positions."""
+        """The drive's frames from `first` to before `stop`, which keep their positions."""
         frames = slice(first, stop)
         plane = [None if axis is None else axis[frames] for axis in (self.x_m, self.y_m)]
         return Drive(self.frames[frames], self.position_m[frames], *plane)

@@ -112,7 +112,7 @@ class Driver(ABC, threading.Thread):
         """Forget what was under way when an error came."""
 
     def ask(self, link: Link, method: str, path: str, body: Any = b"") -> Any:
-        """One counted request."""
+        """Send one request, which is counted."""
         answer = link.ask(method, path, body)
         self.n_requests += 1
         return answer
@@ -167,7 +167,7 @@ class Operator(Driver):
         self._episodes = episodes
 
     def act(self, link: Link) -> None:
-        """One round."""
+        """Do one round."""
         earlier_version = self.ask(link, "GET", f"/v1/domains/{DOMAIN}")["map_version"]
         job = link.remap(DOMAIN, remap_config(self._episodes))
         self._result.n_remaps += 1

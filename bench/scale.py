@@ -66,7 +66,7 @@ class Cache:
 
 @dataclass
 class Replica:
-    """One server, its caches, and until when it works."""
+    """One server with its caches, and the time until which it is busy."""
 
     memory: Cache
     disk: Cache
@@ -93,7 +93,7 @@ class Outcome:
 
 
 def simulated(of: Parameters, seed: int = 0) -> Outcome:
-    """One run."""
+    """Simulate one run."""
     rng = np.random.default_rng(seed)
     popularity = np.cumsum(np.arange(1, of.n_domains + 1) ** -of.zipf)
     end_s, dies_s = 3600 * of.hours, 1800 * of.hours
@@ -166,7 +166,7 @@ def lines() -> Iterator[str]:
 
 
 def row(name: str, outcome: Outcome) -> tuple[str, ...]:
-    """One run's figures."""
+    """The cells of one run."""
     times = (f"{np.percentile(outcome.answer_ms, share):,.1f}" for share in (50, 99, 99.9, 100))
     counts = (f"{count:,}" for count in (outcome.n_loaded, outcome.n_fetched, outcome.n_moved))
     return name, f"{outcome.answer_ms.size:,}", *times, f"{outcome.busy:.0%}", *counts

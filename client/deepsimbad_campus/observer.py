@@ -85,7 +85,7 @@ class Observer:
         return "".join(lines).encode(), table.getvalue().encode()
 
     def _detections(self, frame: int, sightings: list[Sighting]) -> Iterator[dict[str, Any]]:
-        """What a detector makes of a picture."""
+        """The detections of a picture by an imitated detector."""
         rng = stream(self._drive.seed, f"detector {self._drive.date}", frame)
         weather_misses = 0.12 * self._season.snow + 4 * self._season.haze_per_m
         for label, box in sightings:
@@ -103,7 +103,7 @@ class Observer:
             yield _detection(label, np.concatenate([centre - size / 2, centre + size / 2]), rng.uniform(0.3, 0.6))
 
     def _caption(self, frame: int, sightings: list[Sighting]) -> str:
-        """What a person says of a picture."""
+        """The caption of a picture by an imitated person."""
         rng = stream(self._drive.seed, f"caption {self._drive.date}", frame)
         largest = sorted(sightings, key=lambda thing: (thing[1][0] - thing[1][2]) * (thing[1][3] - thing[1][1]))
         counts = Counter((label, _side(box)) for label, box in largest)

@@ -144,7 +144,7 @@ class Renderer:
         return painted
 
     def _labels(self, shot: Shot) -> Image:
-        """What every pixel below the horizon is paved with, an index of the tiles."""
+        """[HEIGHT - GROUND_ROW, WIDTH] index of the tile that every pixel below the horizon is paved with."""
         labels = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8)
         sections, position_m = self._world.ahead(shot.position_m), shot.position_m
         # Short pieces of path near by, where a bend shows; long ones far away.
@@ -163,7 +163,7 @@ class Renderer:
         return labels
 
     def _shadows(self, shot: Shot) -> Image:
-        """Where the ground is in shade, 255 or 0."""
+        """[HEIGHT - GROUND_ROW, WIDTH] 255 where the ground is in shade, else 0."""
         mask, light = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8), shot.light
         north, east, up = light.sun
         reach_per_m, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)

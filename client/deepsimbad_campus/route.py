@@ -130,7 +130,7 @@ class Drive:
         return position, *self._route.place(position, right).T, yaw, pitch, roll
 
     def view(self, frame: int) -> View:
-        """Where the camera is at a frame."""
+        """The camera's pose at a frame."""
         return View(*(float(value[0]) for value in self.poses(self.utime[frame : frame + 1])[1:]))
 
     def ground_truth(self) -> Iterator[Array]:

@@ -42,7 +42,7 @@ class Shot(NamedTuple):
 
 
 def around(world: World, drive: Drive, frame: int) -> Iterator[Thing]:
-    """What stands or moves in sight of a frame, but for walls."""
+    """The things that stand or move in sight of a frame, without walls."""
     position_m, time_s = drive.position_m[frame], int(drive.utime[frame] - drive.utime[0]) / 1e6
     for section in world.ahead(position_m):
         yield from section.things

@@ -1,4 +1,4 @@
-"""What is told of a campus's pictures, and how a recording brings it."""
+"""The detections and captions of a campus's pictures, and how a recording brings them."""
 
 import csv
 import json

@@ -48,7 +48,7 @@ def scene(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
 
 
 def unit(vectors: Array, axis: int = -1) -> Array:
-    """Of unit length along an axis."""
+    """Vectors made unit length along an axis."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=axis, keepdims=True))
 
 
@@ -158,7 +158,7 @@ def _aggregated(network: Network, local: Array) -> Array:
 
 
 def write_matlab(path: Path, network: Network, compressed: bool = True) -> None:
-    """As hloc's `Pitts30K_struct.mat`."""
+    """Write a file laid out as hloc's `Pitts30K_struct.mat`."""
     savemat(path, {"net": matlab_net(network)}, do_compression=compressed)
 
 
@@ -201,7 +201,7 @@ def torch_names(network: Network, trunk: str, pool: str, whitening: str) -> dict
 
 
 def write_pytorch_netvlad(path: Path, network: Network, parallel: str = "") -> None:
-    """As its `checkpoint.pth.tar`: numpy's numbers among the scores, an optimizer's state."""
+    """Write a file laid out as its `checkpoint.pth.tar`: numpy's numbers among the scores, an optimizer's state."""
     names = torch_names(network, f"encoder.{parallel}{{}}", f"pool.{parallel}{{}}", "WPCA.0")
     content = {
         "epoch": 3, "state_dict": names, "recalls": {1: np.float64(0.5)}, "best_score": np.float64(0.5),
@@ -211,13 +211,13 @@ def write_pytorch_netvlad(path: Path, network: Network, parallel: str = "") -> N
 
 
 def write_patch_netvlad(path: Path, network: Network, **changes: Any) -> None:
-    """As `mapillary_WPCA4096.pth.tar`."""
+    """Write a file laid out as `mapillary_WPCA4096.pth.tar`."""
     names = torch_names(network, "encoder.{}", "pool.{}", "WPCA.0")
     torch.save({"num_pcs": 16, "state_dict": names | changes}, path)
 
 
 def write_openibl(path: Path, network: Network) -> None:
-    """As `vgg16_netvlad.pth`, a state dict alone."""
+    """Write a file laid out as `vgg16_netvlad.pth`, a state dict alone."""
     torch.save(torch_names(network, "base_model.base.{}", "net_vlad.{}", "pca_layer"), path)
 
 
@@ -246,7 +246,7 @@ def random_squeezenet() -> dict[str, Array]:
 
 
 def write_caffe(path: Path, parameters: dict[str, Array]) -> None:
-    """As `squeezenet1_0_caffe.npz`."""
+    """Write a file laid out as `squeezenet1_0_caffe.npz`."""
     with path.open("wb") as stream:
         np.savez(stream, allow_pickle=True, **parameters)
 
@@ -264,7 +264,7 @@ def torchvision_names(parameters: dict[str, Array]) -> dict[str, torch.Tensor]:
 
 
 def write_torchvision(path: Path, parameters: dict[str, Array]) -> None:
-    """As `squeezenet1_0-b66bff10.pth`."""
+    """Write a file laid out as `squeezenet1_0-b66bff10.pth`."""
     torch.save(torchvision_names(parameters), path)
 
 

@@ -163,7 +163,7 @@ def test_an_entry_encodes_as_its_model_says(tmp_path, capfd):
     ("entry", "arguments"), [("entry", {"form": form}) for form in ("tensor", "pair", "zero")] + [("wrapped", {})]
 )
 def test_encodings_have_unit_length_and_stand_for_themselves(tmp_path, entry, arguments):
-    """Also of several outputs, of one that sees nothing, and of a model for several devices."""
+    """So are those of several outputs, of one that sees nothing, and of a model for several devices."""
     pull(tmp_path, entry, arguments=arguments)
     extractor = load(tmp_path, entry, largest_batch=2)
     encodings = extractor.encode(scenes())

@@ -24,7 +24,7 @@ _names = (f"fleet-{os.getpid()}-{number}" for number in itertools.count())
 
 @cache
 def cluster():
-    """Begun once; it ends with the process."""
+    """Start the cluster, once; it ends with the process."""
     os.environ.setdefault("RAY_worker_niceness", "0")  # as the command has it
     ray.init(
         num_cpus=100,  # that are counted, not used
@@ -36,7 +36,7 @@ def cluster():
 
 
 class Fleet:
-    """Where a fleet is reached, and its processes."""
+    """The address of a fleet, and its processes."""
 
     def __init__(self, name, address):
         self.name = name
@@ -60,7 +60,7 @@ class Fleet:
 
 @contextmanager
 def running(settings: Settings, n_replicas=2, make_run_job=None, n_administrators=1):
-    """A fleet that answers, and is gone behind the block."""
+    """A fleet that answers within the block, and is deleted after it."""
     name = next(_names)
     store = settings.map_store or f"file://{settings.data_dir}-store"
     settings = settings.model_copy(update={"port": 0, "map_store": store, "log_level": "WARNING"})

@@ -53,7 +53,7 @@ def administered_by(number, of=2):
 
 @dataclass(eq=False)
 class Administrator(Backend):
-    """One that administers, and knows who made which domain, and its own jobs."""
+    """A stand-in for an administrator, which knows who made which domain, and its own jobs."""
 
     made_by: dict[str, int] | None = None  # None: it is away
     jobs: tuple[str, ...] = ()

@@ -79,7 +79,7 @@ def test_who_asks_while_both_owners_are_away_waits_a_while_with_one_key(monkeypa
 
 
 class Administering(Backend):
-    """One that administers, with what it answers; None: it is away."""
+    """A stand-in for an administrator, with the body of its answers; None: it is away."""
 
     def __init__(self, status=HTTPStatus.OK, body=None):
         super().__init__(None)
@@ -138,7 +138,7 @@ def test_of_several_that_administer_the_disk_and_readiness_of_the_worst_are_told
 
 
 class Stuck(Backend):
-    """One that does not answer, though its process lives."""
+    """A process that lives and does not answer."""
 
     def __init__(self):
         super().__init__(None)
@@ -200,7 +200,7 @@ class Started:
 
 
 class Listens:
-    """In the place of an HTTP server."""
+    """A stand-in for an HTTP server, which ends at once."""
 
     def __init__(self, config):
         pass

@@ -49,7 +49,7 @@ class Fitting(StrEnum):
 
 @dataclass(frozen=True)
 class Lesson:
-    """What an evaluator is fitted to."""
+    """The landmarks that an evaluator is fitted to, and all that is known around them."""
 
     encodings: NDArray[np.float32]  # [m, d] of the drive that landmarks were chosen from, in its order
     landmarks: NDArray[np.int64]  # [r] which of its frames they are, in landmark order

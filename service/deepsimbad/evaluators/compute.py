@@ -1,4 +1,4 @@
-"""On what, and how, networks are computed: chosen by whoever makes an evaluator, the same for all networks."""
+"""How, and on which device, networks are computed: chosen for an evaluator, and the same for all its networks."""
 
 import os
 from dataclasses import dataclass, field

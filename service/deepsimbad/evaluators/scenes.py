@@ -47,7 +47,7 @@ class Objects:
 
     @classmethod
     def read(cls, raw: Any) -> Self:
-        """From a JSON list of {"label", "box", "score"}, a score of 1 where none is given; raises InvalidSceneError."""
+        """Read a JSON list of {"label", "box", "score"}, a score of 1 where none is given; raises InvalidSceneError."""
         if not isinstance(raw, Sequence) or isinstance(raw, str):
             raise InvalidSceneError('objects is a list of {"label": "car", "box": [x0, y0, x1, y1], "score": 0.9}')
         if len(raw) > MOST_OBJECTS:
@@ -94,7 +94,7 @@ class Scene:
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Self:
-        """From JSON members `objects` and `text`, one at least; raises InvalidSceneError."""
+        """Read JSON members `objects` and `text`, one at least; raises InvalidSceneError."""
         text, objects = document.get("text"), document.get("objects")
         if text is None and objects is None:
             raise InvalidSceneError("nothing is told: give objects, text, or both")
@@ -108,7 +108,7 @@ class Scene:
 
     @classmethod
     def of_body(cls, body: bytes, media_type: str) -> Self:
-        """From a body `text/plain`, or else `application/json`; raises InvalidSceneError."""
+        """Read a body `text/plain`, or else `application/json`; raises InvalidSceneError."""
         try:
             text = body.decode("utf-8-sig")
             document = {"text": text} if media_type == TEXT else json.loads(text)
@@ -120,7 +120,7 @@ class Scene:
 
     @classmethod
     def of_form(cls, body: bytes) -> tuple[Self, bytes | None]:
-        """From `multipart/form-data` (RFC 7578), and the image file in it; raises InvalidSceneError."""
+        """The scene in `multipart/form-data` (RFC 7578), and the image file in it; raises InvalidSceneError."""
         delimiter = body.partition(b"\r\n")[0]
         pieces = (b"\r\n" + body).split(b"\r\n" + delimiter)
         if not delimiter.startswith(b"--") or len(pieces) < 3 or not pieces[-1].startswith(b"--"):

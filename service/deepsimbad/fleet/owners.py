@@ -1,4 +1,4 @@
-"""Which of several processes is asked: the owners of many domains, and administrators.
+"""Which of several processes is asked: the owners of many domains, and an administrator.
 
 The administrator that makes a domain keeps it: it has the domain's drives and does its jobs. Which one makes a domain
 follows from its name; the one that made it is recorded in the map store, so that another number of administrators

@@ -121,7 +121,7 @@ class AllJobs:
     def newest(
         self, catalog: Catalog, domain: str | None, last_key: int | None, limit: int
     ) -> ListPage[JobRecord, int]:
-        """As `Catalog.newest_jobs`, over all administrators; the jobs of one domain are in its administrator's."""
+        """As `Catalog.newest_jobs`, over all administrators; a domain's jobs are all in its administrator's catalog."""
         if domain is not None:
             return catalog.newest_jobs(domain, last_key, limit)
         responses = [administrator.jobs.remote(last_key, limit + 1) for administrator in self.other_administrators]

@@ -30,7 +30,7 @@ class Extractor(Protocol):
 
     @property
     def weights_sha256(self) -> str | None:
-        """As `Evaluator.weights_sha256`."""
+        """See `Evaluator.weights_sha256`."""
 
     @property
     def largest_batch(self) -> int:

@@ -65,7 +65,7 @@ class EfficientNetLite0:
 
 
 def efficientnet_lite0(_argument: str, compute: Compute) -> EfficientNetLite0:
-    """As the registry makes it; raises as `Evaluator.load`."""
+    """Make the extractor for the registry; raises as `Evaluator.load`."""
     path = weights_file()
     sha256 = file_sha256(path)
     run = make_run(lambda: _module(path), compute, (_SIDE, _SIDE), f"efficientnet_lite0-{_RECIPE}-{sha256[:16]}")

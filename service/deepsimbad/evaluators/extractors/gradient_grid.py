@@ -56,7 +56,7 @@ class GradientGrid:
 
 
 def gradient_grid(_argument: str, _compute: Compute) -> GradientGrid:
-    """As the registry makes it."""
+    """Make the extractor for the registry."""
     return GradientGrid()
 
 

@@ -31,7 +31,7 @@ _IMAGENET = in_pixels(IMAGENET_MEAN), in_pixels(IMAGENET_STD)
 
 
 def netvlad(file: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it, never by ONNX Runtime; raises as `Evaluator.load`."""
+    """Make the extractor for the registry, never run by ONNX Runtime; raises as `Evaluator.load`."""
     path, sha256 = Lock.read(compute.weights_dir).pinned_file(file)
     weights = read_netvlad(path)
     preset = weights.preset

@@ -39,7 +39,7 @@ _CHOICES = {"channels": ("RGB", "BGR"), "layout": ("NCHW", "NHWC")}
 
 
 def onnx_file(argument: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it, on the processor whatever else is wished; raises as `Evaluator.load`."""
+    """Make the extractor for the registry, on the processor whatever `compute` asks for; raises as `Evaluator.load`."""
     if not has_onnxruntime():
         raise MissingPackageError(f"onnx:{argument} needs ONNX Runtime: {INSTALL_FAST}")
     path, sha256 = Lock.read(compute.weights_dir).pinned_file(argument)

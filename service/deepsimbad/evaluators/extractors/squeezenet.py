@@ -41,7 +41,7 @@ _PARTS = (
 
 
 def squeezenet(file: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it; a file in the weights' folder; raises as `Evaluator.load`."""
+    """Make the extractor for the registry from a file in the weights' folder; raises as `Evaluator.load`."""
     if not has_torch():
         raise MissingPackageError(f"squeezenet needs PyTorch: {INSTALL_TORCH}")
     path, sha256 = Lock.read(compute.weights_dir).pinned_file(file)

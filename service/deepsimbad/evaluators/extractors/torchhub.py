@@ -48,7 +48,7 @@ Download = Callable[[str, Path], None]
 
 
 def torchhub(argument: str, compute: Compute) -> NetworkExtractor:
-    """As the registry makes it, by itself in float32, as such models are written; raises as `Evaluator.load`."""
+    """Make the extractor for the registry, by default in float32; raises as `Evaluator.load`."""
     extractor, lock = f"{HUB}{argument}", Lock.read(compute.weights_dir)
     record = lock.hub_record(extractor)
     if record is None:

@@ -20,7 +20,7 @@ _MOST_PIECES = 256  # at once; a longer text is read part by part, and the parts
 
 
 class SentenceBert:
-    """One model, ready; raises MissingPackageError, InvalidWeightsError."""
+    """The model of a folder, loaded; raises MissingPackageError, InvalidWeightsError."""
 
     def __init__(self, folder: Path) -> None:
         try:

@@ -52,7 +52,7 @@ def file_sha256(path: Path) -> str:
 
 
 def encodings_sha256(weights_sha256: str, recipe: int) -> str:
-    """What encodings are told apart by: their weights, and what is done with them.
+    """The digest by which encodings are told apart: of their weights and of how these are used.
 
     `recipe` counts up with whatever else changes an encoding (layers, grid, size, normalisation). The first adds
     nothing, so what was encoded before recipes were counted stays comparable.
@@ -61,7 +61,7 @@ def encodings_sha256(weights_sha256: str, recipe: int) -> str:
 
 
 def load_checkpoint(path: Path) -> Any:
-    """What `torch.save` wrote: tensors, numbers, texts, lists and dicts; a file that names any code runs nothing.
+    """Load what `torch.save` wrote: tensors, numbers, texts, lists and dicts; code that a file names is not run.
 
     Raises:
         InvalidWeightsError: Truncated, no such file, too large unpacked, or with code in it.

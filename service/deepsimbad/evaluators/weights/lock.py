@@ -1,4 +1,4 @@
-"""What was pulled, with its digests: a file in the weights' folder that every later load is held to."""
+"""The lock: a file in the weights' folder with the digests of all that was pulled, which every load checks."""
 
 import hashlib
 import os
