@@ -160,7 +160,7 @@ def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> N
     return np.interp(from_m, route.position_m, values, left=0.0, right=0.0)
 
 
-def added(mass: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def add_evidence(mass: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Masses [m], summing to 1, after values [m] are added, as the paper adds `v[u_k]` to its particles' weights.
 
     Weights have mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1, however many

@@ -19,7 +19,7 @@ from deepsimbad.core.belief.evidence import (
     LOST_AT_START,
     Doubt,
     ViewEvidence,
-    added,
+    add_evidence,
 )
 from deepsimbad.core.belief.motion import (
     LEAST_SURVIVING_SHARE,
@@ -139,7 +139,7 @@ class GridFilter:
         """The belief after a view; `step` as of `predicted`."""
         values = self._at_cells(evidence.values)
         if evidence.is_added:
-            mass, doubt = added(self._believed, values), self.doubt
+            mass, doubt = add_evidence(self._believed, values), self.doubt
             masses, mass_moved = np.outer(1 - doubt.lost, mass), 0.5 * float(np.abs(mass - self._believed).sum())
         else:
             likelihood, least_moved = evidence.likelihood(values, self.doubt.last)

@@ -15,7 +15,7 @@ from deepsimbad.core.belief.evidence import (
     LOST_AT_START,
     Doubt,
     ViewEvidence,
-    added,
+    add_evidence,
     moved_along,
 )
 from deepsimbad.core.belief.grid import GridFilter
@@ -147,7 +147,7 @@ class ParticleFilter:
         least_moved = 0.0
         if evidence.is_added:
             images, on_route = self.route.nearest_image(self.position_m), 1 - self.doubt.lost
-            weights = np.outer(on_route, added(self._mean_weights / on_route.mean(), evidence.values[images]))
+            weights = np.outer(on_route, add_evidence(self._mean_weights / on_route.mean(), evidence.values[images]))
             belief = replace(self, weights=weights, found_mass=np.zeros_like(self.found_mass))
             particles = belief if self.doubt.is_mixture else belief._evened_out(step)
         else:
