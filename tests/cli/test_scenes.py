@@ -1,4 +1,4 @@
-"""Recordings with scenes beside their pictures, which every command takes, by each evaluator of scenes or of both."""
+"""Recordings with scenes beside their pictures: every command takes them, by every kind of evaluator that they need."""
 
 import json
 from importlib.util import find_spec

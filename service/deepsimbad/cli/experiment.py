@@ -357,7 +357,9 @@ def _queries(scores: dict[str, RetrievalScores]) -> str:
 def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
     at_distance = document["anr_at_distance_m"]
     distances_m = next(iter(at_distance.values()))
-    views, metres, wrong = (document[f"{figure}_confident"] for figure in ("views_to", "metres_to", "wrong_when"))
+    views, metres, wrong_shares = (
+        document[f"{figure}_confident"] for figure in ("views_to", "metres_to", "wrong_when")
+    )
     titles = ("planner", "views", "95 %", "metres", "wrong %", "ANR %", "ANR % as in the paper")
     table = Table(*titles, *(f"after {metres} m" for metres in distances_m))
     for name, anr in sorted(document["anr"].items(), key=lambda item: float(views[item[0]])):
@@ -367,7 +369,7 @@ def _print_planners(report: NbvReport, document: dict[str, Any]) -> None:
             f"{views[name]:.2f}",
             f"{low:.2f} .. {high:.2f}",
             f"{metres[name]:.0f}",
-            f"{wrong[name]:.1f}",
+            f"{wrong_shares[name]:.1f}",
             f"{anr:.3f}",
             f"{document['anr_paper'][name]:.2f}",
             *("-" if value is None else f"{value:.2f}" for value in at_distance[name].values()),
@@ -399,21 +401,23 @@ def _print_calibration(document: dict[str, Any], same_route: SameRoute | None) -
 
 
 def _other_robots(document: dict[str, Any]) -> list[str]:
-    reliability, carried, near = (document[part] for part in ("reliability", "carried", "odometry_within_5_m"))
+    reliability, views_to_found, within_5_m = (
+        document[part] for part in ("reliability", "carried", "odometry_within_5_m")
+    )
     bins = zip(reliability["near_mode"], reliability["within_5_m"], strict=True)
-    standing = {name: f"{share:.1f}" for name, share in document["standing_coverage_95"].items()}
-    lost = "-" if document["lost_their_place"] is None else f"{document['lost_their_place']:.1f}"
+    coverage_95 = {name: f"{share:.1f}" for name, share in document["standing_coverage_95"].items()}
+    lost_percent = "-" if document["lost_their_place"] is None else f"{document['lost_their_place']:.1f}"
     off_route = (f"{share:.1f} {stage}" for stage, share in document["off_route"].items())
     return [
         "within 5 m of the mode, % believed: % true: "
-        + ", ".join(f"{believed:.0f}: {true_share:.0f}" for believed, true_share in bins if believed is not None),
-        f"150 views standing still: {standing['unknown']} % covered from an unknown start, {standing['tracked']} % "
-        f"after 50 m, where {lost} % lost their place",
-        f"carried 100 m or more: found after {carried['views_median']:.0f} views, "
-        f"95 of 100 after {carried['views_95']:.0f}",
+        + ", ".join(f"{belief:.0f}: {true_share:.0f}" for belief, true_share in bins if belief is not None),
+        f"150 views standing still: {coverage_95['unknown']} % covered from an unknown start, "
+        f"{coverage_95['tracked']} % after 50 m, where {lost_percent} % lost their place",
+        f"carried 100 m or more: found after {views_to_found['views_median']:.0f} views, "
+        f"95 of 100 after {views_to_found['views_95']:.0f}",
         f"probability of being lost after ten views, %: {', '.join(off_route)}",
         *(
-            f"odometry times {factor}: {coverage:.1f} % covered, {near[factor]:.1f} % within 5 m"
+            f"odometry times {factor}: {coverage:.1f} % covered, {within_5_m[factor]:.1f} % within 5 m"
             for factor, coverage in document["odometry_coverage_95"].items()
         ),
         f"{sum(document['views_refused'].values())} views refused",

@@ -259,9 +259,9 @@ def localize(domain: str, images: tuple[str, ...], rotate: int | None, as_json: 
     settings = given_settings()
     existing_data_dir()
     with open_given_catalog() as catalog:
-        active = Maps(catalog).active(domain)
-        evaluator = EvaluatorPool(settings.compute()).evaluator(active.record.evaluator)
-        snapshot, answers = active.snapshot, list[tuple[str, Any]]()
+        active_map = Maps(catalog).active(domain)
+        evaluator = EvaluatorPool(settings.compute()).evaluator(active_map.record.evaluator)
+        snapshot, answers = active_map.snapshot, list[tuple[str, Any]]()
         levels = levels_in(snapshot.landmark_model)
         for name, observation in views(images, evaluator.forms, evaluator.input_size, levels, rotate):
             watch = Stopwatch()
@@ -294,8 +294,8 @@ def _view_in(
     body, media_type = observation["image"], observation["content_type"]
     if media_type in MEDIA_TYPES:
         levels = levels_in(snapshot.landmark_model)
-        decoded = Decoded.of(ImageFile.read(body, max_pixels), body, evaluator, levels, snapshot.cameras)
-        return NothingSeen() if decoded.is_blank else decoded.image, decoded.remarks
+        picture = Decoded.of(ImageFile.read(body, max_pixels), body, evaluator, levels, snapshot.cameras)
+        return NothingSeen() if picture.is_blank else picture.image, picture.remarks
     scene = read_observation(body, media_type, evaluator, max_pixels)
     return scene, scene.remarks if isinstance(scene, Scene) else ()
 

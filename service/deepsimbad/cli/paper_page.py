@@ -101,10 +101,12 @@ def _anr(document: Document, triplet: Document) -> dict[str, float]:
 
 def _curve(figures: Sequence[Document | None], n: int, scale: Scale) -> dict[str, str]:
     """A line over list lengths, and the area of its interval; brute force has one value for all."""
-    single = next((figure for figure in figures if figure), None)
-    flat = sum(figure is not None for figure in figures) == 1
-    drawn = [single if flat else figure for figure in figures]
-    points_at = [(100 * place / max(1, n - 1), figure) for place, figure in enumerate(drawn) if figure is not None]
+    only_figure = next((figure for figure in figures if figure), None)
+    is_flat = sum(figure is not None for figure in figures) == 1
+    drawn_figures = [only_figure if is_flat else figure for figure in figures]
+    points_at = [
+        (100 * place / max(1, n - 1), figure) for place, figure in enumerate(drawn_figures) if figure is not None
+    ]
 
     def points(value_of: Callable[[Document], float], placed_figures: Sequence[tuple[float, Document]]) -> list[str]:
         return [f"{x:.2f},{100 - scale(value_of(figure)):.2f}" for x, figure in placed_figures]

@@ -182,11 +182,11 @@ def progress_bars(done_column: ProgressColumn) -> Bars:
 @contextmanager
 def progress_bar(stages: Mapping[str, float], title: str, *, cancel_note: str = "") -> Iterator[Progress]:
     """A progress bar over weighted stages; Ctrl-C cancels at the next report, with `cancel_note` in the message."""
-    interrupted = False
+    is_interrupted = False
 
     def interrupt(*_: object) -> None:
-        nonlocal interrupted
-        interrupted = True
+        nonlocal is_interrupted
+        is_interrupted = True
 
     bars = progress_bars(TaskProgressColumn())
     task = bars.add_task(title, total=1.0)
@@ -197,7 +197,7 @@ def progress_bar(stages: Mapping[str, float], title: str, *, cancel_note: str = 
     old_handler = signal.signal(signal.SIGINT, interrupt)
     try:
         with bars:
-            yield Progress(stages, show, lambda: interrupted)
+            yield Progress(stages, show, lambda: is_interrupted)
     except CancelledError as error:
         raise CancelledError(f"{error}{cancel_note}") from error
     finally:

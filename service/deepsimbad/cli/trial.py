@@ -215,8 +215,8 @@ class Album:
         shape = picture_size(content) or (image.shape[1], image.shape[0])  # a square copy tells what it is of
         scale = min(1.0, _LONGEST_PX / max(shape))
         width, height = (max(1, round(scale * side)) for side in shape)
-        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        small_image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        jpeg = cv2.imencode(".jpg", small_image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
         self.n_bytes += len(jpeg)
         return {"uri": f"data:image/jpeg;base64,{b64encode(jpeg).decode()}", "width": width, "height": height}
 
@@ -269,9 +269,9 @@ def _cards(
 
 def _with_cards(stretches: Sequence[Stretch], cards: Sequence[dict[str, Any]]) -> list[tuple[Stretch, int | None]]:
     """Stretches, each with the row of its worst query that has a card; None where none has."""
-    wrong = [(card["position_m"], card["row"]) for card in cards if card["truth"]]
+    wrong_cards = [(card["position_m"], card["row"]) for card in cards if card["truth"]]
     return [
-        (stretch, next((row for at_m, row in wrong if stretch.from_m <= at_m <= stretch.to_m), None))
+        (stretch, next((row for at_m, row in wrong_cards if stretch.from_m <= at_m <= stretch.to_m), None))
         for stretch in stretches
     ]
 

@@ -171,10 +171,10 @@ def _argument(text: str) -> tuple[str, Argument]:
     if not name.isidentifier():
         raise click.BadParameter(f"{text!r} is not of the form KEY=VALUE", param_hint="--argument")
     try:
-        parsed = json.loads(value)
+        number = json.loads(value)
     except ValueError:
         return name, value
-    return name, parsed if isinstance(parsed, bool | int | float | None) else value
+    return name, number if isinstance(number, bool | int | float | None) else value
 
 
 def _agree(extractor: str, yes: bool) -> None:

@@ -139,10 +139,10 @@ def known_drives(
         drive: The drive that is to be fused.
         read: Reads a traverse of the domain.
     """
-    active = catalog.map(domain.name, domain.active_version or 0)
+    record = catalog.map(domain.name, domain.active_version or 0)
     if map_.relevance is not Relevance.COMPOSED:
         return f"places are fused in maps for composed alone, and this one is for {map_.relevance}"
-    names, landmarks = seasons_in(active.config, active.metrics), active.config["landmark_traverse"]
+    names, landmarks = seasons_in(record.config, record.metrics), record.config["landmark_traverse"]
     stored_names = Traverse.list(catalog.data_dir, domain.name)
     if missing_names := [name for name in names if name not in stored_names]:
         return (
@@ -151,8 +151,8 @@ def known_drives(
     drives = [(read(name), agrees) for name, agrees in names.items() if name is not None]
     if any(season.encoding_dim != drive.encoding_dim for season, _ in drives):
         return "the drives that the map is made of come from another encoder by now"
-    candidates = drives[0][0] if active.metrics.get("landmarks") == TRAINING else None
-    if active.metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored_names:
+    candidates = drives[0][0] if record.metrics.get("landmarks") == TRAINING else None
+    if record.metrics.get("landmarks") == LANDMARK_TRAVERSE and landmarks in stored_names:
         candidates = read(landmarks)
     return KnownDrives.of(map_, drives, candidates) or "the drives that the map is made of hold other frames by now"
 
@@ -170,9 +170,9 @@ class FusedMap:
     u: NDArray[np.float32]  # [m, k] of the drive
     pairs: NDArray[np.int64]  # [p, 2] (map image, frame)
 
-    def without(self, withheld: NDArray[np.int64]) -> Map:
+    def without(self, withheld_frames: NDArray[np.int64]) -> Map:
         """The map as it would be without the drive's withheld frames."""
-        pairs = self.pairs[~np.isin(self.pairs[:, 1], withheld)]
+        pairs = self.pairs[~np.isin(self.pairs[:, 1], withheld_frames)]
         places = unit(self.season_sums + _season(self.u, pairs, self.base.n_images))
         landmarks = learnt_landmarks(places, self.landmarks, self.base.list_length)
         base = replace(self.base, landmark_model={**self.base.landmark_model, "prototypes": landmarks})
@@ -213,8 +213,8 @@ def fuse(
         return None, verdict
 
     pairs = [
-        known_drives.fusable(same_places(earlier.route(), map_.route), number)
-        for number, earlier in enumerate(known_drives.seasons)
+        known_drives.fusable(same_places(earlier_drive.route(), map_.route), number)
+        for number, earlier_drive in enumerate(known_drives.seasons)
     ]
     pairs.append(known_drives.fusable(season.places))
     if not pairs[-1].size:
@@ -333,13 +333,13 @@ def append_drive(map_: Map, drive: Drive) -> Map:
 def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
     """The map with a drive's frames of lists [h, m] among its images; the nearest image gives all else they need."""
     route = drive.route(map_.closed)
-    nearest, is_near = nearest_known(map_, route.position_m)
+    nearest_images, is_near = nearest_known(map_, route.position_m)
     q_values, bits = map_.q_values, map_.view_bits
     if q_values is not None:
-        q_values = np.where(is_near[:, np.newaxis], q_values[nearest], np.float32(NnqlConfig().initial_q))
+        q_values = np.where(is_near[:, np.newaxis], q_values[nearest_images], np.float32(NnqlConfig().initial_q))
     if bits is not None:
-        bits = np.where(is_near, bits[nearest], bits.mean(dtype=np.float32))
-    chance = None if map_.coverage is None else np.where(is_near, map_.coverage[nearest], np.float32(np.nan))
+        bits = np.where(is_near, bits[nearest_images], bits.mean(dtype=np.float32))
+    chance = None if map_.coverage is None else np.where(is_near, map_.coverage[nearest_images], np.float32(np.nan))
     return map_.with_images(
         {
             "lists": lists,
@@ -359,17 +359,17 @@ def with_frames(map_: Map, drive: Drive, lists: NDArray[np.uint16]) -> Map:
 def nearest_known(map_: Map, position_m: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """The map image nearest to each position [m], and whether it is within the longest move."""
     route, placed_m = map_.route, _on_route(map_, position_m)
-    nearest = route.nearest_image(placed_m)
-    apart_m = np.abs(route.offset_m(placed_m - route.position_m[nearest], 0.0))
-    return nearest, apart_m <= map_.longest_action_m
+    nearest_images = route.nearest_image(placed_m)
+    apart_m = np.abs(route.offset_m(placed_m - route.position_m[nearest_images], 0.0))
+    return nearest_images, apart_m <= map_.longest_action_m
 
 
 def _on_route(map_: Map, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions [m] as the route counts them: those outside a closed route's first turn are wrapped into it."""
     route = map_.route
     ahead_m = position_m - route.start_m
-    inside = (ahead_m >= 0) & (ahead_m < route.length_m)
-    return np.where(inside, position_m, route.wrapped(position_m))
+    is_inside = (ahead_m >= 0) & (ahead_m < route.length_m)
+    return np.where(is_inside, position_m, route.wrapped(position_m))
 
 
 def camera_domain(catalog: Catalog, camera_of: str, domain: DomainRecord) -> DomainRecord:
@@ -408,9 +408,9 @@ def camera_seasons(catalog: Catalog, camera_of: str, domain: DomainRecord, train
     other = camera_domain(catalog, camera_of, domain)
     if other.active_version is None:
         raise NoActiveMapError(f"domain {camera_of}, which camera_of names, has no active map", domain=camera_of)
-    active = catalog.map(camera_of, other.active_version)
-    names = [name or "?" for name, agrees in seasons_in(active.config, active.metrics).items() if agrees]
-    its_map = f"map {active.version} of domain {camera_of}"
+    record = catalog.map(camera_of, other.active_version)
+    names = [name or "?" for name, agrees in seasons_in(record.config, record.metrics).items() if agrees]
+    its_map = f"map {record.version} of domain {camera_of}"
     if len(names) < 2:
         raise InvalidMapConfigError(f"{its_map} knows no second season: map it from two drives of its route first")
     stored_names = Traverse.list(catalog.data_dir, camera_of)
@@ -432,7 +432,7 @@ def camera_seasons(catalog: Catalog, camera_of: str, domain: DomainRecord, train
     first, *seasons = drives
     route = first.route(other.closed)
     seasons_seen = [SeenTwice(first, season, same_places(season.route(), route)) for season in seasons]
-    if not any(covers(route.position_m, twice.places[:, 0]) for twice in seasons_seen):
+    if not any(covers(route.position_m, pair.places[:, 0]) for pair in seasons_seen):
         raise InvalidMapConfigError(
             f"{its_map} knows too few places in two seasons: {LEAST_SHARED_PLACES} over half of the route are the least"
         )

@@ -135,7 +135,7 @@ def encode_block(
         on_read: Called with the place of every frame that was read or found broken; what it raises ends the block.
     """
     encoding_cache, broken = {} if encoding_cache is None else encoding_cache, {}
-    readable: list[int] = []
+    read_places: list[int] = []
     encodings = np.empty((len(places), evaluator.encoding_dim or 0), np.float32)
     shows_nothing = np.zeros(len(places), np.bool_)
     pictures: dict[int, Image | Scene] = {}  # by the row of its encoding
@@ -143,10 +143,10 @@ def encode_block(
     started_s = time.perf_counter()
     for place in places:
         frame = recording.frames[place]
-        stamp, row = recording.stamp(frame), len(readable)
+        stamp, row = recording.stamp(frame), len(read_places)
         if stamp in encoding_cache:
             encodings[row], shows_nothing[row] = encoding_cache[stamp]
-            readable.append(place)
+            read_places.append(place)
         else:
             try:
                 body = recording.image(frame, evaluator.input_size)
@@ -160,7 +160,7 @@ def encode_block(
                     raise InvalidSceneError(f"{frame.name}: {error.message}", **error.hints) from error
                 shows_nothing[row] = shows_none(pictures[row])
                 stamps.append(stamp)
-                readable.append(place)
+                read_places.append(place)
         on_read(place)
     if pictures:
         encodings[list(pictures)] = evaluator.encode(list(pictures.values()))
@@ -168,8 +168,8 @@ def encode_block(
             {stamp: (encodings[row], bool(shows_nothing[row])) for stamp, row in zip(stamps, pictures, strict=True)}
         )
     image_ms = 1000 * (time.perf_counter() - started_s) / len(pictures) if pictures else None
-    n_read = len(readable)
-    return EncodedBlock(np.array(readable, np.int64), encodings[:n_read], shows_nothing[:n_read], broken, image_ms)
+    n_read = len(read_places)
+    return EncodedBlock(np.array(read_places, np.int64), encodings[:n_read], shows_nothing[:n_read], broken, image_ms)
 
 
 def places_of_blocks(n_frames: int, evaluator: Evaluator) -> list[range]:
@@ -325,7 +325,7 @@ def _composed_in_space(
         in_space(landmarks) if isinstance(landmarks, Drive) else landmarks,
         n_landmarks,
         on_progress,
-        [replace(twice, first=in_space(twice.first), second=in_space(twice.second)) for twice in camera],
+        [replace(pair, first=in_space(pair.first), second=in_space(pair.second)) for pair in camera],
     )
     full_model = {**model, **map_build.map.landmark_model}
     full_map, rehearsal = (replace(map_, landmark_model=full_model) for map_ in (map_build.map, map_build.rehearsal))

@@ -95,19 +95,19 @@ def check_map(
     """
     active_version = catalog.domain(domain).active_version
     its_name = f"map {active_version}, which serves,"
-    active = active_ranks = active_images = None
+    active_map = active_ranks = active_images = None
     reason = "no map serves yet that the new one could be compared with" if active_version is None else None
     configs = {"the new map": config}
     own_images = frames.images_in(new_map, config)
     ranks = _normalised_ranks(new_map, frames, own_images, evaluator, lambda share: on_progress(share / 2))
     if active_version is not None:
         try:
-            active = load_snapshot(catalog, domain, active_version)
-            WeightsDifferError.check("a map", active.weights_sha256, "a frame", frames.drive.weights_sha256)
+            active_map = load_snapshot(catalog, domain, active_version)
+            WeightsDifferError.check("a map", active_map.weights_sha256, "a frame", frames.drive.weights_sha256)
             configs[its_name.removesuffix(",")] = its_config = catalog.map(domain, active_version).config
-            active_images = frames.images_in(active, its_config)
+            active_images = frames.images_in(active_map, its_config)
             active_ranks = _normalised_ranks(
-                active, frames, active_images, evaluator, lambda share: on_progress(0.5 + share / 2)
+                active_map, frames, active_images, evaluator, lambda share: on_progress(0.5 + share / 2)
             )
         except (DamagedMapError, RetiredMapError):
             reason = f"{its_name} is damaged and cannot be compared"
@@ -137,7 +137,7 @@ def check_map(
     anr = float(100 * ranks[is_scored].mean()) if is_scored.any() else None
     has_passed: bool | None = None
     if gate_margin is not None:
-        has_passed = anr_active is not None or active is None
+        has_passed = anr_active is not None or active_map is None
         if anr is not None and anr_active is not None and anr > anr_active + gate_margin:
             has_passed = False
             reason = (
@@ -193,8 +193,8 @@ def _normalised_ranks(
     for first in range(0, len(frames.queries), _QUERIES_A_BLOCK):
         block = slice(first, first + _QUERIES_A_BLOCK)
         relevance = relevances(map_, views.at(block))
-        near = true_images_of(frames.route, map_.route, TOLERANCE_M, frames=frames.queries[block])
-        for query, (row, images) in enumerate(zip(relevance, near, strict=True), first):
+        true_images_of_queries = true_images_of(frames.route, map_.route, TOLERANCE_M, frames=frames.queries[block])
+        for query, (row, images) in enumerate(zip(relevance, true_images_of_queries, strict=True), first):
             true_images = np.searchsorted(remaining_images, images[is_remaining[images]])
             if true_images.size:
                 ranks[query] = rank_of_truth(row[remaining_images], true_images) / remaining_images.size

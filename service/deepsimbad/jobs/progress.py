@@ -117,8 +117,8 @@ def in_threads(pieces: Sequence[Callable[[], None]]) -> None:
     """Do all pieces, as many at once as there are cores; the first error ends them, and is raised."""
     with ThreadPoolExecutor(available_cores()) as pool:
         futures = [pool.submit(piece) for piece in pieces]
-        finished, waiting = wait(futures, return_when=FIRST_EXCEPTION)
-        for future in waiting:
+        finished_futures, waiting_futures = wait(futures, return_when=FIRST_EXCEPTION)
+        for future in waiting_futures:
             future.cancel()
-        for future in finished:
+        for future in finished_futures:
             future.result()

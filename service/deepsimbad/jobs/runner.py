@@ -118,9 +118,9 @@ class JobRunner:
             UnavailableError: The service is shutting down.
         """
         with self._submit_lock:
-            earlier = self.earlier_job(job_id, config)
-            if earlier is not None:
-                return earlier
+            earlier_record = self.earlier_job(job_id, config)
+            if earlier_record is not None:
+                return earlier_record
             if self._closing.is_set():
                 raise UnavailableError("the service is shutting down and takes no new job")
             if len(self._catalog.waiting_jobs()) >= self._max_waiting:
@@ -302,9 +302,9 @@ class InThisProcess:
     def _learn(self, job: JobRecord, progress: Progress) -> dict[str, Any]:
         with open_catalog(self.data_dir) as catalog:
             progress.check()
-            sealed = catalog.map_of_job(job.domain, job.job_id)
-            if sealed is not None:  # what it learnt is in there; a second time would count double
-                return serve_learnt(catalog, job.domain, sealed, progress)
+            record = catalog.map_of_job(job.domain, job.job_id)
+            if record is not None:  # what it learnt is in there; a second time would count double
+                return serve_learnt(catalog, job.domain, record, progress)
             with SessionStore.open(self.data_dir) as sessions:
                 walks = walks_of(sessions, catalog, job.domain, job.config["session_id"])
             return learn_online(catalog, job.domain, walks, progress, job.job_id)
@@ -448,8 +448,8 @@ def _death(code: int, is_cancelled: bool) -> DeepSimbadError:
 def _log_here(record: dict[str, Any], job_id: str) -> None:
     """Write a record of the child to this process's log."""
     levelname = logging.getLevelName(record["levelno"])
-    plain = {"name": record["name"], "levelno": record["levelno"], "levelname": levelname}
+    fields = {"name": record["name"], "levelno": record["levelno"], "levelname": levelname}
     text = {"msg": "%s", "args": (record["msg"],)}
     logging.getLogger(record["name"]).handle(
-        logging.makeLogRecord({**record["extra"], **plain, **text, "job_id": job_id})
+        logging.makeLogRecord({**record["extra"], **fields, **text, "job_id": job_id})
     )

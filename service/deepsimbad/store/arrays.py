@@ -77,9 +77,9 @@ def is_halvable(numbers: NDArray[Any]) -> bool:
     """Whether float32 lose nothing as float16: our networks' encodings are rounded to that."""
     if numbers.dtype != np.float32:
         return False
-    flat = numbers.reshape(-1)
+    numbers_1d = numbers.reshape(-1)
     with np.errstate(over="ignore"):
-        parts = (flat[start : start + PART_BYTES // 4] for start in range(0, flat.size, PART_BYTES // 4))
+        parts = (numbers_1d[start : start + PART_BYTES // 4] for start in range(0, numbers_1d.size, PART_BYTES // 4))
         return all(np.array_equal(part.astype(np.float16), part) for part in parts)
 
 
@@ -93,8 +93,8 @@ def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
             raise InvalidInputError(f"{name} holds NaN or infinity; every one must be finite")
         lowest, highest = (float(array.min()), float(array.max())) if array.size else (0.0, 0.0)
         step = (highest - lowest) / np.iinfo(_CODES).max
-        scaled = (array.astype(np.float64) - lowest) / step if step > 0 else np.zeros(array.shape)
-        codes = np.ascontiguousarray(np.rint(scaled), _CODES)
+        steps = (array.astype(np.float64) - lowest) / step if step > 0 else np.zeros(array.shape)
+        codes = np.ascontiguousarray(np.rint(steps), _CODES)
         body = zlib.compress(codes.reshape(-1, 1).view(np.uint8)[:, ::-1].T.tobytes(), 6)
         shape = to_json(list(array.shape))
         checksum.add(table, name, 0, _CODES.str, shape, repr(lowest), repr(step), body)

@@ -347,14 +347,14 @@ def inspect(data_dir: Path, on_progress: Progress) -> Inspection:
         problems[path] = _problems(data_dir, path, digest)
         on_progress(n_read / len(files))
     new_files = _files(data_dir) if any(problems.values()) else {}
-    damaged = [
+    findings = [
         Finding(path.relative_to(data_dir).as_posix(), line)
         for path in new_files
         if problems.get(path)
         for line in _problems(data_dir, path, new_files[path])
         if line in problems[path]
     ]
-    return Inspection(len(files), tuple(damaged))
+    return Inspection(len(files), tuple(findings))
 
 
 def _files(data_dir: Path) -> dict[Path, str | None]:

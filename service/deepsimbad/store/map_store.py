@@ -53,10 +53,10 @@ class MapStore:
     def store_id(self) -> str:
         """What the first entry of the log calls the store; it is written where there is none."""
         name = _entry_name(0)
-        if (founding := self._objects.get(name)) is None:
+        if (entry := self._objects.get(name)) is None:
             self._objects.create(name, to_json({"store_id": uuid4().hex}).encode())
-            founding = self._objects.get(name) or b"{}"
-        return str(_parse(founding, name).get("store_id"))
+            entry = self._objects.get(name) or b"{}"
+        return str(_parse(entry, name).get("store_id"))
 
     def entries(self, position: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """(number, entry) of the log's entries behind number `position`; one request where there is none yet.

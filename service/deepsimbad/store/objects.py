@@ -136,8 +136,8 @@ class Objects:
         with self._faults(name):
             download = self._store.get(name)
             part.write_bytes(download.bytes().to_bytes())
-            modified = download.meta["last_modified"].timestamp()
-        os.utime(part, (modified, modified))
+            modified_s = download.meta["last_modified"].timestamp()
+        os.utime(part, (modified_s, modified_s))
         part.replace(target)
 
     def delete(self, name: str) -> None:

@@ -247,14 +247,14 @@ class Traverse(Spool):
 
     def _equal(self, db: Database, frames: Drive) -> NDArray[np.int64]:
         """The indices of those frames that are stored already; raises FramesDifferError where one differs."""
-        stored = _identities(db, frames.index)
-        common_indices, rows, _ = np.intersect1d(frames.index, stored["index"], return_indices=True)
-        differing = differences({name: getattr(frames, name)[rows] for name in IDENTITY}, stored)
-        if differing:
-            indices = common_indices[np.any(list(differing.values()), axis=0)].tolist()
+        stored_identities = _identities(db, frames.index)
+        common_indices, rows, _ = np.intersect1d(frames.index, stored_identities["index"], return_indices=True)
+        masks = differences({name: getattr(frames, name)[rows] for name in IDENTITY}, stored_identities)
+        if masks:
+            indices = common_indices[np.any(list(masks.values()), axis=0)].tolist()
             raise FramesDifferError(
                 f"{len(indices)} frames of traverse {self.name} are there already and differ in "
-                f"{', '.join(differing)}, the first of index {indices[0]}: nothing was stored. Have them "
+                f"{', '.join(masks)}, the first of index {indices[0]}: nothing was stored. Have them "
                 "replaced, or choose another traverse",
                 n_differing=len(indices),
                 indices=indices[:_NAMED_INDICES],

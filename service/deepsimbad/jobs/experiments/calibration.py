@@ -77,23 +77,25 @@ class CalibrationReport:
 
     def as_dict(self, sources: dict[str, Any]) -> dict[str, Any]:
         """The flat JSON document; shares in percent."""
-        moving = {f"{action_m:g}": self.sights[stage] for stage, action_m in _MOVING.items()}
-        odometry = {f"{factor:g}": self.sights[stage] for stage, factor in _ODOMETRY.items()}
-        standing, tracked = self.sights["standing"].is_covered, self.sights["tracked, then standing"]
-        is_held = tracked.is_covered[:, -_STANDING_VIEWS:]
-        has_stayed = tracked.is_near[tracked.is_near[:, _TRACKED_MOVES] == 1, -1]
+        moving_sights = {f"{action_m:g}": self.sights[stage] for stage, action_m in _MOVING.items()}
+        odometry_sights = {f"{factor:g}": self.sights[stage] for stage, factor in _ODOMETRY.items()}
+        is_standing_covered, tracked_sight = self.sights["standing"].is_covered, self.sights["tracked, then standing"]
+        is_tracked_covered = tracked_sight.is_covered[:, -_STANDING_VIEWS:]
+        has_stayed = tracked_sight.is_near[tracked_sight.is_near[:, _TRACKED_MOVES] == 1, -1]
         n_views = views_until_found(self.sights["carried"].is_near[:, -_SEARCHING_VIEWS:])
         return {
-            "coverage_95": {a: {str(v): _percent(s.is_covered[:, v - 1]) for v in VIEWS} for a, s in moving.items()},
-            "set_m": {a: {str(v): float(s.set_m[:, v - 1].mean()) for v in VIEWS} for a, s in moving.items()},
-            "reliability": reliability(list(moving.values())),
-            "wrong_when_confident": {move: wrong_when_confident(sight) for move, sight in moving.items()},
-            "standing_coverage_95": {"unknown": _percent(standing), "tracked": _percent(is_held)},
+            "coverage_95": {
+                a: {str(v): _percent(s.is_covered[:, v - 1]) for v in VIEWS} for a, s in moving_sights.items()
+            },
+            "set_m": {a: {str(v): float(s.set_m[:, v - 1].mean()) for v in VIEWS} for a, s in moving_sights.items()},
+            "reliability": reliability(list(moving_sights.values())),
+            "wrong_when_confident": {move: wrong_when_confident(sight) for move, sight in moving_sights.items()},
+            "standing_coverage_95": {"unknown": _percent(is_standing_covered), "tracked": _percent(is_tracked_covered)},
             "lost_their_place": _percent(1 - has_stayed),
             "carried": {"views_median": float(np.median(n_views)), "views_95": float(np.quantile(n_views, 0.95))},
             "off_route": {stage: _percent(self.sights[stage].off_route[:, -1]) for stage in _STRETCHES},
-            "odometry_coverage_95": {factor: _percent(sight.is_covered) for factor, sight in odometry.items()},
-            "odometry_within_5_m": {factor: _percent(sight.is_near) for factor, sight in odometry.items()},
+            "odometry_coverage_95": {factor: _percent(sight.is_covered) for factor, sight in odometry_sights.items()},
+            "odometry_within_5_m": {factor: _percent(sight.is_near) for factor, sight in odometry_sights.items()},
             "views_refused": {stage: int(sight.is_refused.sum()) for stage, sight in self.sights.items()},
             "second_season": None if self.same_route is None else self.same_route.as_dict(),
             "config": {**asdict(self.config), **sources},
@@ -132,15 +134,15 @@ def views_until_found(is_near: NDArray[np.float64]) -> NDArray[np.int64]:
 
 def smallest_set(mass: NDArray[np.float64]) -> NDArray[np.bool_]:
     """[n] whether an image is in the smallest set that holds 95 % of the mass; all that tie with its last are."""
-    descending = np.sort(mass)[::-1]
-    n_before = (np.cumsum(descending) < 0.95 * mass.sum() * (1 - 1e-12)).sum()
-    return np.asarray(mass >= descending[n_before])
+    masses = np.sort(mass)[::-1]
+    n_before = (np.cumsum(masses) < 0.95 * mass.sum() * (1 - 1e-12)).sum()
+    return np.asarray(mass >= masses[n_before])
 
 
 def calibration_stages() -> dict[str, float]:
     """The stages `run_calibration` reports, with their weights."""
-    driving = dict.fromkeys(_MOVING, 8.0) | {"standing": 4.0, "tracked, then standing": 4.0, "carried": 3.0}
-    return {"map": 8.0, **driving, **dict.fromkeys((*_ODOMETRY, *_STRETCHES), 2.0)}
+    stages = dict.fromkeys(_MOVING, 8.0) | {"standing": 4.0, "tracked, then standing": 4.0, "carried": 3.0}
+    return {"map": 8.0, **stages, **dict.fromkeys((*_ODOMETRY, *_STRETCHES), 2.0)}
 
 
 def run_calibration(
@@ -233,8 +235,8 @@ def _sight(belief: BeliefFilter, truth: int, is_refused: bool) -> Sight:
     route, mass = belief.route, belief.mass
     mode, members = int(mass.argmax()), smallest_set(mass)
     off_m = abs(float(route.offset_m(route.position_m[[truth]], float(route.position_m[mode]))[0]))
-    near, set_m = near_mode(route, mass, mode) * (1 - belief.off_route), float(route.cell_m[members].sum())
-    return Sight(members[truth], set_m, near, off_m <= CONFIDENT_WITHIN_M, belief.off_route, is_refused)
+    near_share, set_m = near_mode(route, mass, mode) * (1 - belief.off_route), float(route.cell_m[members].sum())
+    return Sight(members[truth], set_m, near_share, off_m <= CONFIDENT_WITHIN_M, belief.off_route, is_refused)
 
 
 def _paths(course: _Course) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:

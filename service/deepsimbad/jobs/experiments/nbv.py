@@ -79,7 +79,7 @@ class EpisodeRunner:
 
     def run(self, episode: int, start: int, choose: Chooser) -> Episode:
         """Run one episode from a test frame; it goes on to 20 moves where it is not sure, while the drive lasts."""
-        shares, travelled = np.empty(self.n_steps), np.empty(self.n_steps)
+        shares, travelled_m = np.empty(self.n_steps), np.empty(self.n_steps)
         route, position_m = self.drive.route, float(self.drive.route.position_m[start])
         step = self.localizer.step(self.localizer.start(), self.drive.views.at(start))
         moved_m, certainty = 0.0, self._certainty(step, position_m, 1, 0.0)
@@ -92,11 +92,11 @@ class EpisodeRunner:
             moved_m, position_m = moved_m + abs(action_m), position_m + action_m
             step, share = self.observe(step.state, position_m, action_m)
             if number < self.n_steps:
-                shares[number], travelled[number] = share, moved_m
+                shares[number], travelled_m[number] = share, moved_m
             certainty = certainty or self._certainty(step, position_m, number + 2, moved_m)
         views, metres, is_wrong = certainty or (MOST_MOVES + 1, moved_m, False)
         penalty_views = PENALTY_VIEWS if is_wrong or certainty is None else 0
-        return Episode(shares, travelled, float(views + penalty_views), metres, is_wrong)
+        return Episode(shares, travelled_m, float(views + penalty_views), metres, is_wrong)
 
     def _certainty(self, step: Step, position_m: float, views: int, metres: float) -> tuple[int, float, bool] | None:
         """`views`, `metres` and whether a robot that is sure of its place is wrong; None where it is not sure."""
@@ -187,7 +187,7 @@ class NbvReport:
         shares = {name: 100 * self._values(name, "rank_share") for name in self.our_episodes}
         by_episode = {name: rows.mean(axis=1) for name, rows in shares.items()}
         views, metres = ({name: self._values(name, part) for name in self.our_episodes} for part in ("views", "metres"))
-        wrong = {name: 100 * self._values(name, "is_wrong") for name in self.our_episodes}
+        wrong_shares = {name: 100 * self._values(name, "is_wrong") for name in self.our_episodes}
         rivals = (RANDOM, self.best_constant)
         return {
             "anr": _means(by_episode),
@@ -200,7 +200,7 @@ class NbvReport:
             "difference_95": self._differences(by_episode, rivals),
             "views_to_confident": {**_means(views), "interval_95": self._intervals(views)},
             "metres_to_confident": {**_means(metres), "interval_95": self._intervals(metres)},
-            "wrong_when_confident": {**_means(wrong), "interval_95": self._intervals(wrong)},
+            "wrong_when_confident": {**_means(wrong_shares), "interval_95": self._intervals(wrong_shares)},
             "views_difference_95": self._differences(views, rivals),
             "best_constant": self.best_constant,
             "anr_by_step": {name: rows.mean(axis=0).tolist() for name, rows in shares.items()},

@@ -64,37 +64,37 @@ def paper_document(config: PaperConfig, results: Mapping[str, Document]) -> Docu
     lengths = [h for h in config.list_lengths if all(str(h) in document for document in results.values())]
     by_length = {h: {triplet: document[str(h)] for triplet, document in results.items()} for h in lengths}
     h = min(lengths, key=lambda length: abs(length - config.list_length))
-    active = {triplet: document["active"] for triplet, document in results.items()}
+    active_documents = {triplet: document["active"] for triplet, document in results.items()}
     views = {
         length: PooledFigures.of({t: document["blocks"] for t, document in by_length[length].items()})
         for length in lengths
     }
     moves = {
-        setup: PooledFigures.of({triplet: document["blocks"][setup] for triplet, document in active.items()})
+        setup: PooledFigures.of({triplet: document["blocks"][setup] for triplet, document in active_documents.items()})
         for setup in (*SETUPS, "views")
     }
-    first_document, first_moves = next(iter(by_length[h].values())), next(iter(active.values()))
+    first_document, first_moves = next(iter(by_length[h].values())), next(iter(active_documents.values()))
     return {
-        "anr": {str(length): pooled.figures(config.seed) for length, pooled in views.items()},
+        "anr": {str(length): figures.figures(config.seed) for length, figures in views.items()},
         "recall": _mean_of([document["recall"] for document in by_length[h].values()]),
         "anr_at": _mean_of([document["anr_at"] for document in by_length[h].values()]),
-        "active": {setup: pooled.figures(config.seed) for setup, pooled in moves.items()},
-        "wrong_when_confident": _mean_of([_numbers(document["wrong_when"]) for document in active.values()]),
-        "metres_to_confident": _mean_of([_numbers(document["metres_to"]) for document in active.values()]),
-        "mean_move_m": _mean_of([document["mean_move_m"] for document in active.values()]),
+        "active": {setup: figures.figures(config.seed) for setup, figures in moves.items()},
+        "wrong_when_confident": _mean_of([_numbers(document["wrong_when"]) for document in active_documents.values()]),
+        "metres_to_confident": _mean_of([_numbers(document["metres_to"]) for document in active_documents.values()]),
+        "mean_move_m": _mean_of([document["mean_move_m"] for document in active_documents.values()]),
         "index_bits_per_map_image": _mean_of([document["index_bits"] for document in by_length[h].values()]),
-        "took_ms": _mean_of([document["took_ms"] for document in active.values()]),
+        "took_ms": _mean_of([document["took_ms"] for document in active_documents.values()]),
         "evaluations": first_moves["evaluations"],
         "evaluations_s": first_moves["evaluations_s"],
         "evaluations_of_the_paper": config.training_episodes * 10 * config.n_landmarks,
         "list_length": h,
         "n_queries": sum(document["n_queries"] for document in by_length[h].values()),
         "n_left_out": sum(document["n_left_out"] for document in by_length[h].values()),
-        "n_episodes": sum(document["n_episodes"] for document in active.values()),
+        "n_episodes": sum(document["n_episodes"] for document in active_documents.values()),
         "second_season": {triplet: document["second_season"] for triplet, document in by_length[h].items()},
         "claims": [
             *_claims_of_views(views[h], by_length[h], config.seed),
-            *_claims_of_moves(moves, active, config.seed),
+            *_claims_of_moves(moves, active_documents, config.seed),
         ],
         "by_triplet": {
             triplet: {
@@ -103,7 +103,7 @@ def paper_document(config: PaperConfig, results: Mapping[str, Document]) -> Docu
                 "active": {"ours": document["anr"], "paper": document["anr_paper"]},
                 "views_to_confident": _numbers(document["views_to"]),
             }
-            for triplet, document in active.items()
+            for triplet, document in active_documents.items()
         },
         "methods": [*first_document["anr"]],
     }
@@ -195,27 +195,27 @@ def _claims_of_moves(
         is_less = [figures_of(document)[name] < figures_of(document)[rival] for document in documents.values()]
         return _judge(claim, moves[setup], name, rival, is_less, seed, said_by)
 
-    pooled, views = moves["paper"], moves["views"]
-    best, soonest = (
+    paper_figures, view_figures = moves["paper"], moves["views"]
+    best_move, soonest_move = (
         min((name for name in figures.sums if name.startswith(CONSTANT)), key=figures.mean)
-        for figures in (pooled, views)
+        for figures in (paper_figures, view_figures)
     )
     move_m = float(np.mean([document["mean_move_m"]["paper"][NNQL] for document in documents.values()]))
     claims = [
         judge("NNQL beats random moves", "paper", NNQL, RANDOM),
-        judge(f"NNQL beats the best constant move, {display_name(best)}", "paper", NNQL, best),
+        judge(f"NNQL beats the best constant move, {display_name(best_move)}", "paper", NNQL, best_move),
         judge("Informed needs fewer views than random moves", "views", DEFAULT_PLANNER, RANDOM, "us"),
         judge(
-            f"Informed needs fewer views than the best constant move, {display_name(soonest)}",
-            *("views", DEFAULT_PLANNER, soonest, "us"),
+            f"Informed needs fewer views than the best constant move, {display_name(soonest_move)}",
+            *("views", DEFAULT_PLANNER, soonest_move, "us"),
         ),
     ]
     ends = [f"{CONSTANT}_1", f"{CONSTANT}_10"]
     for claim in [claim for claim in claims[:2] if claim["verdict"] != HOLDS][:1]:
         claim["why"] = (
-            f"Constant moves score from {pooled.mean(ends[0]):.2f} % (1 m) to {pooled.mean(ends[1]):.2f} % (10 m), "
-            f"the best of them {pooled.mean(best):.2f} %; NNQL moved {move_m:.1f} m on average and scored "
-            f"{pooled.mean(NNQL):.2f} %."
+            f"Constant moves score from {paper_figures.mean(ends[0]):.2f} % (1 m) to "
+            f"{paper_figures.mean(ends[1]):.2f} % (10 m), the best of them {paper_figures.mean(best_move):.2f} %; NNQL "
+            f"moved {move_m:.1f} m on average and scored {paper_figures.mean(NNQL):.2f} %."
         )
     return claims
 

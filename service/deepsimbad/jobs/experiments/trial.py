@@ -132,13 +132,13 @@ def run_trial(
     progress.stage("localize")
     views = views_of(measure_drive(queries, map_build.map.landmark_model, evaluator))
     scorer, all_scorer, outcomes = RetrievalScorer(RECALL_RANKS), RetrievalScorer(RECALL_RANKS), []
-    nearest, beliefs, n_forgot = nearest_images(queries, database), [], 0
+    nearest_map_images, beliefs, n_forgot = nearest_images(queries, database), [], 0
     all_relevances = relevances_by_all(map_build, views, moves_between(queries), stateless=False)
     answers = zip(true_images, all_relevances, _in_order(map_build.map, views, queries), strict=True)
     for row, (truth, frame_relevances, (relevance, belief, has_forgotten)) in enumerate(answers):
         all_scorer.add(frame_relevances, truth)
         rank, mass = scorer.add(relevance, truth), belief.mass
-        outcomes.append(_outcome(map_build.map, relevance, mass, truth, rank, int(nearest[row])))
+        outcomes.append(_outcome(map_build.map, relevance, mass, truth, rank, int(nearest_map_images[row])))
         beliefs.append(belief.route.histogram_of(mass))
         n_forgot += has_forgotten
         progress.update((row + 1) / len(true_images))
@@ -200,11 +200,11 @@ def _stretches(queries: Drive, outcomes: Sequence[Outcome]) -> list[Stretch]:
     stretches = []
     for number in range(edges_m.size - 1):
         stretch_outcomes = [outcome for outcome, part in zip(outcomes, stretch_of, strict=True) if part == number]
-        scored = [outcome for outcome in stretch_outcomes if outcome.rank is not None]
-        errors = [outcome.error_m for outcome in scored if outcome.is_wrong and outcome.error_m is not None]
+        scored_outcomes = [outcome for outcome in stretch_outcomes if outcome.rank is not None]
+        errors = [outcome.error_m for outcome in scored_outcomes if outcome.is_wrong and outcome.error_m is not None]
         if errors:
             ends_m = float(edges_m[number]), float(edges_m[number + 1])
-            stretches.append(Stretch(*ends_m, len(scored), len(errors), float(np.median(errors))))
+            stretches.append(Stretch(*ends_m, len(scored_outcomes), len(errors), float(np.median(errors))))
     return sorted(stretches, key=lambda stretch: (-stretch.n_wrong / stretch.n_queries, -stretch.median_error_m))
 
 

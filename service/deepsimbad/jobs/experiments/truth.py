@@ -17,10 +17,10 @@ _MOSTLY = 0.5  # of a drive's frames
 def nearest_images(test: Drive, training: Drive) -> NDArray[np.int64]:
     """[m] the map image nearest to every test frame: in the plane where both know it, else along the route."""
     route = training.route()
-    nearest = route.nearest_image(test.position_m).astype(np.int64)
+    images = route.nearest_image(test.position_m).astype(np.int64)
     pairs = same_places(test.route(), route, tolerance_m=np.inf)
-    nearest[pairs[:, 1]] = pairs[:, 0]
-    return nearest
+    images[pairs[:, 1]] = pairs[:, 0]
+    return images
 
 
 def test_drive_warnings(test: Drive, **drives: Drive | None) -> list[str]:
