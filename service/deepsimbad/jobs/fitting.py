@@ -68,7 +68,7 @@ class RecordingPictures:
 
 
 class SpooledPictures:
-    """Those that wait with a traverse, where views of them are kept too; `fallback` has those that do not wait."""
+    """The images that wait with a traverse, which keeps views of them too; `fallback` has those that do not wait."""
 
     def __init__(self, traverse: Traverse, drive: Drive, fallback: Pictures | None = None) -> None:
         self._traverse, self._levels, self._dim = traverse, drive.grey_levels, drive.encoding_dim

@@ -14,7 +14,7 @@ _INTERVAL_S = 0.2  # least time between two reports of one stage
 
 @dataclass(frozen=True)
 class ProgressState:
-    """One moment of a job."""
+    """How far a job is at one moment."""
 
     stage: str  # the stage under way
     progress: float  # share of all stages done, 0..1

@@ -132,7 +132,7 @@ _Draft: TypeAlias = tuple[Map, Map, dict[str, Any], dict[str, Any]]
 
 @dataclass(frozen=True)
 class _Remap:
-    """One remap's surroundings, as the arguments of `remap`; the methods are its stages."""
+    """One remap, with the arguments of `remap`; its methods are the stages."""
 
     catalog: Catalog
     domain: str

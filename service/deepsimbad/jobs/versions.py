@@ -97,7 +97,7 @@ class ExperienceConfig:
         return cls(session_id, hashlib.sha256(body).hexdigest())
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """The JSON form."""
         return asdict(self)
 
 

@@ -25,7 +25,7 @@ class Checksum:
         self.value = 0
 
     def add(self, *parts: str | int | bytes) -> None:
-        """Continue with these."""
+        """Continue the checksum with `parts`."""
         for part in parts:
             body = part if isinstance(part, bytes) else str(part).encode("ascii", "backslashreplace")
             self.value = zlib.crc32(body, self.value)
@@ -131,7 +131,7 @@ def pack_texts(texts: NDArray[np.str_]) -> NDArray[np.uint8]:
 
 
 def unpack_texts(packed: NDArray[np.uint8], n_texts: int) -> NDArray[np.str_]:
-    """Back from `pack_texts`. Raises ValueError: they are not so many texts."""
+    """Read what `pack_texts` made; raises ValueError where they are not `n_texts` texts."""
     try:
         body = zlib.decompressobj().decompress(packed.tobytes(), n_texts * _TEXT_BYTES)
     except zlib.error as error:

@@ -178,7 +178,7 @@ def _add_copy(tar: tarfile.TarFile, data_dir: Path, path: Path, folder: Path) ->
 
 
 def _add_files(tar: tarfile.TarFile, data_dir: Path, domain: str, folder: Path) -> Iterator[dict[str, Any]]:
-    """A domain's traverses, and the pictures that it keeps."""
+    """Copy a domain's traverses and pictures; yields their entries for the manifest."""
     pictures = layout.thumbnails_path(data_dir, domain)
     traverses = sorted(layout.traverses_folder(data_dir, domain).glob("*.sqlite"))
     for path in [*traverses, pictures] if pictures.exists() else traverses:
@@ -247,7 +247,7 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
 
 
 def _manifest(tar: tarfile.TarFile, file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What a backup says of itself and of its members, which are those that it holds."""
+    """Read the manifest and its members, which must be those that the backup holds; raises InvalidArchiveError."""
     try:
         infos = [info for info in tar.getmembers() if info.name not in {_MANIFEST, _OLD_DIGEST_MEMBER}]
         stream = tar.extractfile(_MANIFEST)
@@ -358,7 +358,7 @@ def inspect(data_dir: Path, on_progress: Progress) -> Inspection:
 
 
 def _files(data_dir: Path) -> dict[Path, str | None]:
-    """What there is to read, as of now, and the digests of sealed maps."""
+    """The files that there are now, with the digests of those that are sealed maps."""
     catalog, sessions = layout.catalog_path(data_dir), layout.sessions_path(data_dir)
     files: dict[Path, str | None] = {catalog: None}
     if sessions.exists():

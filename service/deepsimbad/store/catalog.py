@@ -55,7 +55,7 @@ class ApiKey:
 
     @classmethod
     def new(cls) -> Self:
-        """A key that nobody has had before."""
+        """Make a key that nobody has had before."""
         return cls(secrets.token_hex(6), secrets.token_urlsafe(32))
 
     @classmethod
@@ -66,7 +66,7 @@ class ApiKey:
 
     @property
     def text(self) -> str:
-        """What its holder sends."""
+        """The text that its holder sends."""
         return f"dsk_{self.key_id}_{self.secret}"
 
     @property

@@ -45,13 +45,13 @@ class MapStore:
 
     @classmethod
     def open(cls, url: str) -> Self:
-        """As `Objects.open`."""
+        """The map store at a URL; raises as `Objects.open`."""
         return cls(Objects.open(url))
 
     # The log
 
     def store_id(self) -> str:
-        """What the first entry of the log calls the store; it is written where there is none."""
+        """The id of the store, which its log's first entry holds; that entry is written where there is none."""
         name = _entry_name(0)
         if (entry := self._objects.get(name)) is None:
             self._objects.create(name, to_json({"store_id": uuid4().hex}).encode())

@@ -71,7 +71,7 @@ def spool_size(db: Database) -> tuple[int, int]:
 
 
 def clear_spool(db: Database, indices: Sequence[int], contents: Sequence[int]) -> None:
-    """Before frames are written: what waits for frames of those indices gives way, views of equal pictures stay."""
+    """Before frames are written: delete pictures of those indices, and views but those of equal pictures."""
     db.conn.executemany(
         """
         DELETE FROM view_encoding WHERE frame_index = ?1
@@ -83,7 +83,7 @@ def clear_spool(db: Database, indices: Sequence[int], contents: Sequence[int]) -
 
 
 def spool_pictures(db: Database, indices: Sequence[int], pictures: Mapping[int, bytes]) -> None:
-    """After frames were written: their pictures wait."""
+    """After frames were written: store their pictures in the spool."""
     db.conn.executemany(
         "INSERT INTO spool (frame_index, body) VALUES (?, ?)",
         ((index, pictures[index]) for index in indices if index in pictures),

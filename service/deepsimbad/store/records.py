@@ -68,7 +68,7 @@ class DomainRecord:
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """What it was made with and keeps."""
+        """What the domain was made with, which never changes."""
         return {"evaluator": self.evaluator, "closed": self.closed, "actions_m": list(self.actions_m)}
 
 
@@ -209,7 +209,7 @@ def current_moment(behind: str | None = None) -> str:
 
 
 def moment_after(wait: timedelta) -> str:
-    """The moment that follows now by `wait`; raises InvalidInputError past the year 9999."""
+    """The moment `wait` from now, as `current_moment` writes it; raises InvalidInputError past the year 9999."""
     try:
         return _text(datetime.now(UTC) + wait)
     except OverflowError as error:

@@ -72,7 +72,7 @@ class ListedSession:
 
 @dataclass(frozen=True)
 class IdempotencyKey:
-    """The sender's word by which a request that comes again is known, and the digest of that request."""
+    """A sender's key by which a repeated request is known, and the digest of that request."""
 
     key: str
     digest: bytes
@@ -147,7 +147,7 @@ class SessionStore(OpenFile):
         super().close()
 
     def try_writing(self) -> Future[None]:
-        """Write something to the disk that means nothing."""
+        """Write something to the disk that means nothing, to see whether that works."""
 
         def write(db: Database) -> None:
             (version,) = db.execute("PRAGMA user_version").fetchone()
@@ -338,7 +338,7 @@ class SessionStore(OpenFile):
         return self._commits.submit(write)
 
     def true_positions(self, number: int) -> NDArray[np.float64] | None:
-        """What was fed back of a session, one position in metres for every observation; NaN where unknown."""
+        """The true positions [n] in metres of a session's observations, NaN where unknown; None: none were fed back."""
         with self._reading() as db:
             return _true_positions(db, number)
 

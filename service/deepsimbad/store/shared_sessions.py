@@ -131,7 +131,7 @@ class SharedSessionStore(SessionStore):
         return {name: Mark.parse(name) for name in self._objects.names("living/", previous_name)}
 
     def holders(self, *, may_have_ended: bool = False) -> list[str | None]:
-        """As where nothing is shared, of all nodes.
+        """As `SessionStore.holders`, of all nodes.
 
         Args:
             may_have_ended: Whether sessions that have ended since all were listed, a minute ago at most, may count:
@@ -144,11 +144,11 @@ class SharedSessionStore(SessionStore):
         return [mark.key_id for mark in (marks | new_marks).values()]
 
     def pins(self) -> set[tuple[str, int]]:
-        """As where nothing is shared, of all nodes."""
+        """As `SessionStore.pins`, of all nodes."""
         return {(mark.domain, mark.map_version) for mark in self.marks()}
 
     def living_sessions(self) -> list[SessionRecord]:
-        """Those in the file, and as they began those in the objects that this node looks after."""
+        """Those in the file and, as they began, those in the objects that this node looks after."""
         names = [_name(mark.session_id, 0) for mark in self.marks() if self._is_own(mark.session_id)]
         sessions = [_unpack(body) for body in self._readers.map(self._objects.get, names) if body is not None]
 
@@ -175,7 +175,7 @@ class SharedSessionStore(SessionStore):
     # One session
 
     def create(self, record: SessionRecord) -> Future[SessionRecord]:
-        """As where nothing is shared."""
+        """As `SessionStore.create`."""
 
         def write() -> SessionRecord:
             columns = session_columns(record)
@@ -205,7 +205,7 @@ class SharedSessionStore(SessionStore):
     def append(
         self, number: int, row: JournalRow, written_at: float, snapshot: StateSnapshot | None = None
     ) -> Future[None]:
-        """As where nothing is shared."""
+        """As `SessionStore.append`."""
 
         def write() -> None:
             session_id = self._id(number)
@@ -219,7 +219,7 @@ class SharedSessionStore(SessionStore):
         return self._writers.submit(write)
 
     def end(self, number: int, ending: str, ended_at: float) -> Future[bool]:
-        """As where nothing is shared; False where another node has ended it, or moved it on since it was to expire."""
+        """As `SessionStore.end`; False where another node has ended it, or moved it on since it was to expire."""
 
         def write() -> bool:
             record = self.find(self._id(number))
@@ -235,7 +235,7 @@ class SharedSessionStore(SessionStore):
     def save_true_positions(
         self, number: int, position_m: NDArray[np.float64], received_at: float
     ) -> Future[NDArray[np.float64] | None]:
-        """As where nothing is shared; where two nodes save for one session at once, one answer may be lost."""
+        """As `SessionStore.save_true_positions`; of two nodes that save at once one may be lost."""
 
         def write() -> NDArray[np.float64] | None:
             save, name = super(SharedSessionStore, self).save_true_positions, f"truths/{self._id(number)}"

@@ -54,7 +54,7 @@ _DTYPE_OF_BYTES = {2.0: "<f2", 4.0: "<f4"}  # by the bytes of one number
 
 @dataclass(frozen=True)
 class TraverseSummary:
-    """A traverse and what of it has arrived."""
+    """What has arrived of a traverse."""
 
     name: str
     n_frames: int

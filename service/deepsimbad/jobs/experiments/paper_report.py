@@ -46,7 +46,7 @@ class PooledFigures:
         return {name: {"mean": self.mean(name), **self._intervals(sums, seed)} for name, sums in self.sums.items()}
 
     def difference(self, name: str, rival: str, seed: int) -> Document:
-        """A method's less its rival's, frame by frame."""
+        """A method's figure less its rival's, frame by frame, with its intervals."""
         return {"mean": self.mean(name) - self.mean(rival), **self._intervals(self.sums[name] - self.sums[rival], seed)}
 
     def _intervals(self, sums: NDArray[np.float64], seed: int) -> dict[str, list[float]]:

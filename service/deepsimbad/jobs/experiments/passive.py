@@ -126,7 +126,7 @@ def _step(localizer: ActiveLocalizer, state: LocalizerState, view: Query, moved_
 def _sum_views(
     map_: Map, window_views: Sequence[_ViewRelevances], field_name: str, speed: float
 ) -> NDArray[np.float64]:
-    """[n] relevances of the last views, each moved along to where the robot is now; the latest is last."""
+    """The sum [n] of relevances to the last views, latest last, each moved along to where the robot is now."""
     now_m, total = window_views[-1].position_m, np.zeros(map_.n_images)
     for window_view in window_views:
         relevance = getattr(window_view, field_name).astype(np.float64)

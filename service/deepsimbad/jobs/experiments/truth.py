@@ -88,7 +88,7 @@ def _says_which(rows: NDArray[Any]) -> bool:
 
 
 def _frames(accepted: Any) -> list[int]:
-    """The numbers of frames; raises ValueError and TypeError."""
+    """Frame numbers as a list of ints; raises ValueError and TypeError."""
     frames = np.atleast_1d(accepted).tolist()
     if any(frame != int(frame) for frame in frames):
         raise ValueError(f"{frames} are no whole numbers")
