@@ -248,11 +248,18 @@ def shortlist_length(snapshot: Map, n_shortlist: int | None) -> int:
 
 
 def warm_up() -> None:
-    """Answer views on a small map of the default kind and move on, which compiles the kernels: seconds, once."""
+    """Answer views on two small maps of the default kind and move on, which compiles the kernels: seconds, once.
+
+    A map whose images stand at equal distances has kernels of its own.
+    """
     evaluator = FeatureL2("none")
-    drive = Drive(position_m=np.arange(8.0), encodings=np.random.default_rng(0).normal(size=(8, 5)).astype(np.float32))
-    map_ = compose_map(MapPlan(Relevance.COMPOSED, 2, (1.0,)), drive, None, None, 4).map
-    localizer = ActiveLocalizer(map_, LocalizerConfig())
-    step = localizer.step(localizer.start(), Query(np.arange(1, 5, dtype=np.float32)))
-    localizer.step(step.state, describe(map_, evaluator, ReadyEncoding(np.ones(5))), 1.0)
-    localize(map_, evaluator, ReadyEncoding(np.ones(5)))
+    encodings = np.random.default_rng(0).normal(size=(8, 5)).astype(np.float32)
+    views = (RankedLandmarks((0, 1, 2, 3)), RankedLandmarks((0,)), ReadyEncoding(np.ones(5)))
+    for position_m in (np.arange(8.0), np.arange(8.0) ** 1.1):
+        drive = Drive(position_m=position_m, encodings=encodings)
+        map_ = compose_map(MapPlan(Relevance.COMPOSED, 2, (1.0,)), drive, None, None, 4).map
+        localizer = ActiveLocalizer(map_, LocalizerConfig())
+        state = localizer.start()
+        for view in views:
+            state = localizer.step(state, describe(map_, evaluator, view), 1.0).state
+            localize(map_, evaluator, view)
