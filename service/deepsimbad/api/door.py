@@ -76,7 +76,8 @@ class Door:
     """ASGI middleware around all routes.
 
     A request counts as under way from when its body has come to when its answer begins: whoever sends or reads slowly
-    takes memory for what was sent, but nobody's turn. Health, readiness and metrics are always answered.
+    takes memory for what was sent, but nobody's turn. Health, readiness and metrics need no
+    key and no turn.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
