@@ -23,7 +23,7 @@ from deepsimbad.evaluators.image import decode_deep as decode_file
 from deepsimbad.evaluators.image import resized
 from deepsimbad.evaluators.image_files import ImageFile
 from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError, TooManyLeftOutError
-from deepsimbad_client.http import media_type_of
+from deepsimbad_client.http import media_type_of, text_of
 
 Image = NDArray[np.uint8]  # [height, width, 3] BGR
 
@@ -53,6 +53,11 @@ class Frame:
     x_m: float | None = None  # first ground coordinate (NCLT: north)
     y_m: float | None = None  # second ground coordinate (NCLT: east)
     heading_rad: float | None = None  # in (-pi, pi], turning from x towards y
+
+    @property
+    def stored_name(self) -> str:
+        """The name as traverses and maps hold it."""
+        return text_of(self.name)
 
 
 def columns_of(frames: Sequence[Frame]) -> dict[str, Any]:

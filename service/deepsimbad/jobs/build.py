@@ -28,7 +28,6 @@ from deepsimbad.evaluators.scenes import Scene, check_whole, read_observation, s
 from deepsimbad.evaluators.space import dissimilarities_and_vectors
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad_client.errors import BrokenFrameError
-from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import Frame, LeftOut, Recording, columns_of, counts_of
 from deepsimbad_client.recordings.annotations import as_taken
 
@@ -103,7 +102,7 @@ def encode_recording(
 
     drive = Drive(
         **columns_of(frames),
-        frame_name=np.array([text_of(frame.name) for frame in frames]),
+        frame_name=np.array([frame.stored_name for frame in frames]),
         encodings=encodings,
         weights_sha256=weights_sha256,
         grey_levels=recording.grey_levels,
