@@ -34,7 +34,7 @@ from deepsimbad.core.experience.training import TrainingWorld, train
 from deepsimbad.core.landmark_model import select_landmarks
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import PlanningView, information_ahead, plan_by_experience
-from deepsimbad.core.relevance import DEFAULT_UPDATE, Query, Relevance
+from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.store.map_file import index_bytes, read_map, seal, table_bytes, write_map
@@ -126,7 +126,7 @@ def nnql_table() -> Iterator[str]:
     for relevance in (Relevance.RRF, Relevance.STANDARDISED, Relevance.COMPOSED):
         spent = _in_own_process(relevance.value)
         times = (f"{spent['seconds']:.1f} s", f"{spent['processor_seconds']:.1f} s", f"{spent['peak_mb']:.0f} MB")
-        rows.append((f"{relevance.value}, {DEFAULT_UPDATE[relevance].value}", *times))
+        rows.append((f"{relevance.value}, {relevance.traits.update.value}", *times))
     yield from markdown(head, rows)
     yield ""
     rng = np.random.default_rng(0)  # values as training leaves them: about 950, hardly two alike

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.belief.evidence import TRUSTS
-from deepsimbad.core.relevance import OTHER_LIKELIHOOD_SCALE, Relevance
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine import localizer
 from deepsimbad.engine.localizer import (
     Dissimilarities,
@@ -34,7 +34,7 @@ def test_standardised_belief_is_the_normalised_exponential() -> None:
     z = [(NormalDist().inv_cdf((i + 0.5) / N_LANDMARKS) - mean[i]) / std[i] for i in range(N_LANDMARKS)]
     slow = np.array([-sum(z[snapshot.lists[j, m]] for j in range(LIST_LENGTH)) for m in range(N_IMAGES)])
     np.testing.assert_allclose(localization.relevance, slow, rtol=1e-5, atol=1e-6)
-    parts = np.array([np.exp(trust * OTHER_LIKELIHOOD_SCALE * (slow - slow.mean())) for trust in TRUSTS])
+    parts = np.array([np.exp(trust * snapshot.log_likelihood_scale * (slow - slow.mean())) for trust in TRUSTS])
     # Images are evenly spaced: a uniform prior weighs them alike, and a first view leaves trusts as they were.
     mass = np.array([0.2, 0.4, 0.4]) @ (parts / parts.sum(axis=1, keepdims=True))
     np.testing.assert_allclose(localization.belief.top_mass, np.sort(mass)[::-1], rtol=1e-4)

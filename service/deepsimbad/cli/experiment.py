@@ -30,7 +30,7 @@ from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.planners import DEFAULT_PLANNER
-from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Relevance, UpdateRule
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance, UpdateRule
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.registry import EvaluatorConfig, make_evaluator
@@ -185,7 +185,7 @@ def nbv(evaluator: EvaluatorConfig, relevance: str | None, update: str | None, *
     our_relevance = Relevance(relevance) if relevance else DEFAULT_RELEVANCE
     config = NbvConfig(
         relevance=our_relevance,
-        update=UpdateRule(update) if update else DEFAULT_UPDATE[our_relevance],
+        update=UpdateRule(update) if update else our_relevance.traits.update,
         same_route=options["same_route"] is not False,
         **{name: options[name] for name in ("list_length", "training_episodes", "episodes", "seed")},
     )

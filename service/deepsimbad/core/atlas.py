@@ -28,7 +28,7 @@ from deepsimbad.core.belief.evidence import LOST_AT_START
 from deepsimbad.core.composed import list_weights
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import FAR_STD, Query, Relevance, strangeness
+from deepsimbad.core.relevance import FAR_STD, Query, strangeness
 from deepsimbad.errors import InvalidMapConfigError
 
 RELEVANCE_WEIGHT, USUAL_RELEVANCE = 0.74, 0.43  # A, R
@@ -47,7 +47,7 @@ def log_evidence(map_: Map, query: Query) -> float:
         InvalidMapConfigError: The map's relevances have no meaning beside another map's.
         InvalidInputError: The query lacks what they compare.
     """
-    if map_.relevance is not Relevance.COMPOSED:
+    if not map_.relevance.traits.compares_unit_vectors:
         raise InvalidMapConfigError(f"relevances of {map_.relevance} mean nothing beside another map's")
     if not query.is_informative:
         return 0.0

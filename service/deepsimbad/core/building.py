@@ -102,7 +102,7 @@ def build_from_dissimilarities(
     views = own_views(map_, dissimilarities)
     if plan.relevance is Relevance.STANDARDISED:
         map_ = replace(map_, view_bits=view_bits(map_, views, map_, season))
-    if season is not None and other is not None and plan.relevance is Relevance.BRUTE_FORCE:
+    if season is not None and other is not None and not plan.relevance.traits.is_listed:
         season = replace(season, encodings=other.encodings)
     map_ = replace(map_, coverage=placed_rightly(map_, views, season))
     on_progress(1.0)
@@ -398,7 +398,7 @@ def build_map(relevance: Relevance, drive: Drive, list_length: int, closed: bool
         x_m=route.x_m,
         y_m=route.y_m,
         lists=lists,
-        encodings=drive.encodings if relevance is Relevance.BRUTE_FORCE else None,
+        encodings=None if relevance.traits.is_listed else drive.encodings,
         **arrays,
     )
 

@@ -17,9 +17,6 @@ from deepsimbad.core.descriptor import MAX_LANDMARKS, LandmarkStatistics
 from deepsimbad.core.frames import Camera
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
 from deepsimbad.core.relevance import (
-    DEFAULT_LIKELIHOOD_SCALE,
-    DEFAULT_UPDATE,
-    OTHER_LIKELIHOOD_SCALE,
     LiveStatistics,
     Query,
     Relevance,
@@ -36,14 +33,6 @@ MOST_ACTION_M = 1000.0
 _USUAL_NOVELTY_M = 3.0  # over which views cease to err alike, where it was not measured
 _SHARED = 0.5  # share of the novelty curve that repeats, where it was not measured
 _SAME_PLACE_M = 0.3
-
-# Arrays that relevances compare besides lists.
-_NEEDS: dict[str | None, tuple[str, ...]] = {
-    Relevance.STANDARDISED: ("statistics",),
-    Relevance.COMPOSED: ("statistics", "usual_encoding", "usual_product"),
-    Relevance.SIMBAD: ("values",),
-    Relevance.BRUTE_FORCE: ("encodings",),
-}
 
 
 def _row(dtype: type[np.generic], *axes: str | int, unknown: float | str | None = None) -> dict[str, Any]:
@@ -136,7 +125,7 @@ class Map:
             raise InvalidMapConfigError("actions_m are no metres")
         object.__setattr__(self, "actions_m", actions_m.astype(np.float64))
         self._check_shapes()
-        for name in _NEEDS.get(self.config.get("relevance"), ()):
+        for name in self.relevance.traits.arrays if self.config.get("relevance") in set(Relevance) else ():
             if getattr(self, name) is None:
                 raise InvalidMapConfigError(f"a map for {self.relevance} needs {name}")
         for array in (*self.arrays().values(), *self.landmark_model.values(), self.actions_m):
@@ -289,7 +278,7 @@ class Map:
     @property
     def update_rule(self) -> UpdateRule:
         """How a view changes the belief by default."""
-        return DEFAULT_UPDATE[self.relevance]
+        return self.relevance.traits.update
 
     @property
     def weights_sha256(self) -> str | None:
@@ -378,7 +367,7 @@ class Map:
         """The factor that makes a relevance, less its mean over the map, a log-likelihood."""
         if self.likelihood_scale is not None:
             return float(self.likelihood_scale[0])
-        return DEFAULT_LIKELIHOOD_SCALE.get(self.relevance, OTHER_LIKELIHOOD_SCALE)
+        return self.relevance.traits.likelihood_scale
 
     def alike_after(self, action_m: float) -> float:
         """How alike views err before and after a move, 1 to 0."""

@@ -16,7 +16,6 @@ from deepsimbad.core.descriptor import normal_scores, rank_landmarks
 from deepsimbad.core.drive import SecondSeason
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Relevance
 
 SEASONS_ALIKE = 0.6  # correlation of a landmark's scores in two seasons, as development recordings have it on average
 _SURE = np.pi / np.sqrt(6 * (1 - SEASONS_ALIKE**2))  # the best scale of a softmax of scores with noise
@@ -53,7 +52,7 @@ def rehearsed(map_: Map, dissimilarities: NDArray[np.float32], season: SecondSea
         "novelty": novelty_curve(map_.position_m[images], difference - difference.mean(axis=0), longest_m),
         "repeated": repeated,
     }
-    if map_.relevance is Relevance.COMPOSED:
+    if map_.relevance.traits.compares_unit_vectors:
         arrays["likelihood_scale"] = np.array([likelihood_scale(map_, season)])
     return arrays
 
@@ -75,8 +74,8 @@ def own_views(map_: Map, places: NDArray[np.float32]) -> OwnViews:
             those of `composed`, whose scale is of this camera.
         places: [n, r] dissimilarities of what its lists stand for.
     """
-    is_whole, route = map_.relevance is Relevance.BRUTE_FORCE, map_.route
-    n_most = _WHOLE_PLACES if is_whole else _DISTINCT_PLACES
+    traits, route = map_.relevance.traits, map_.route
+    n_most = _DISTINCT_PLACES if traits.is_listed else _WHOLE_PLACES
     images = np.linspace(0, map_.n_images - 1, min(map_.n_images, n_most)).astype(np.int64)
     views = SecondSeason(places, np.stack([images, images], axis=1), map_.encodings)
     bits, near_shares = np.empty((2, images.size))
@@ -89,7 +88,7 @@ def own_views(map_: Map, places: NDArray[np.float32]) -> OwnViews:
         is_near = apart_m <= _NEAR_M
         near = (likelihood * is_near).sum(axis=1) / is_near.sum(axis=1)
         bits[block] = np.log2(near / likelihood.mean(axis=1) + 1e-300)
-        if map_.relevance is not Relevance.COMPOSED:
+        if not traits.compares_unit_vectors:
             likelihood = np.exp(_SURE * ahead / np.maximum(relevance.std(axis=1, keepdims=True), 1e-9))
         near_shares[block] = (likelihood * (apart_m <= WITHIN_M)).sum(axis=1) / likelihood.sum(axis=1)
     return OwnViews(images, bits, near_shares)
@@ -227,7 +226,7 @@ def smoothed(
 
 def _scores(map_: Map, dissimilarities: NDArray[np.float32]) -> NDArray[np.floating]:
     """[n, r] scores of views, lowest is nearest: dissimilarities where the map compares those, else normal scores."""
-    if map_.relevance is Relevance.COMPOSED:
+    if map_.relevance.traits.compares_dissimilarities:
         return dissimilarities
     return normal_scores(rank_landmarks(dissimilarities), map_.n_landmarks)
 

@@ -27,6 +27,11 @@ class Relevance(StrEnum):
     SIMBAD = "simbad"
     BRUTE_FORCE = "brute_force"
 
+    @property
+    def traits(self) -> "RelevanceTraits":
+        """What it compares, and what maps for it hold."""
+        return _TRAITS[self]
+
 
 DEFAULT_RELEVANCE = Relevance.COMPOSED
 FAR_STD = 2.0  # standard deviations from the mean, beyond which a number of an encoding is far off
@@ -80,19 +85,38 @@ class UpdateRule(StrEnum):
     MIXTURE = "mixture"
 
 
-DEFAULT_UPDATE = {
-    Relevance.COMPOSED: UpdateRule.MIXTURE,
-    Relevance.STANDARDISED: UpdateRule.MIXTURE,
-    Relevance.RRF: UpdateRule.ADDITIVE_RELEVANCE,
-    Relevance.BAG_OF_LANDMARKS: UpdateRule.ADDITIVE_RELEVANCE,
-    Relevance.SIMBAD: UpdateRule.ADDITIVE_RECIPROCAL_RANK,
-    Relevance.BRUTE_FORCE: UpdateRule.ADDITIVE_RECIPROCAL_RANK,
-}
+@dataclass(frozen=True)
+class RelevanceTraits:
+    """What a relevance compares, and what maps for it hold."""
 
-# The factor that makes a relevance a log-likelihood, where a map has not learnt it. The h landmarks of a list are not
-# independent witnesses, so summed scores count by less than 1.
-DEFAULT_LIKELIHOOD_SCALE = {Relevance.COMPOSED: 12.0}
-OTHER_LIKELIHOOD_SCALE = 0.3
+    update: UpdateRule  # by default
+    arrays: tuple[str, ...] = ()  # of a map, that are compared besides its lists
+    compares_unit_vectors: bool = False  # by cosines, which mean the same in all maps; seasons are fused into them
+    compares_encodings: bool = False  # of views
+    compares_dissimilarities: bool = False  # of views
+    is_listed: bool = True  # whether lists stand for map images, and not whole encodings
+    # The factor that makes it a log-likelihood, where a map has not learnt it. The h landmarks of a list are not
+    # independent witnesses, so summed scores count by less than 1.
+    likelihood_scale: float = 0.3
+
+
+_TRAITS = {
+    Relevance.COMPOSED: RelevanceTraits(
+        UpdateRule.MIXTURE,
+        ("statistics", "usual_encoding", "usual_product"),
+        compares_unit_vectors=True,
+        compares_encodings=True,
+        compares_dissimilarities=True,
+        likelihood_scale=12.0,
+    ),
+    Relevance.STANDARDISED: RelevanceTraits(UpdateRule.MIXTURE, ("statistics",)),
+    Relevance.RRF: RelevanceTraits(UpdateRule.ADDITIVE_RELEVANCE),
+    Relevance.BAG_OF_LANDMARKS: RelevanceTraits(UpdateRule.ADDITIVE_RELEVANCE),
+    Relevance.SIMBAD: RelevanceTraits(UpdateRule.ADDITIVE_RECIPROCAL_RANK, ("values",), compares_dissimilarities=True),
+    Relevance.BRUTE_FORCE: RelevanceTraits(
+        UpdateRule.ADDITIVE_RECIPROCAL_RANK, ("encodings",), compares_encodings=True, is_listed=False
+    ),
+}
 
 
 def mean_ranks(relevance: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -16,7 +16,6 @@ import numpy as np
 from deepsimbad.core import atlas
 from deepsimbad.core.frames import Camera
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.localizer import Localization, ReadyEncoding, View, describe, localize, ready_encodings
 from deepsimbad.engine.maps import MappedDomain, Maps
 from deepsimbad.engine.worker import EncodedImage
@@ -201,7 +200,7 @@ class Atlas:
 def _takes(snapshot: Map, view: View, encoding: np.ndarray) -> bool:
     """Whether a map can be asked for an encoding together with others; else it is asked alone and may raise."""
     statistics = snapshot.live_statistics
-    if snapshot.relevance is not Relevance.COMPOSED or statistics is None or statistics.encodings is None:
+    if not snapshot.relevance.traits.compares_unit_vectors or statistics is None or statistics.encodings is None:
         return False
     view_weights, map_weights = getattr(view, "weights_sha256", None), snapshot.weights_sha256
     are_known = view_weights is not None and map_weights is not None

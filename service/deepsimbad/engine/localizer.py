@@ -35,8 +35,6 @@ from deepsimbad.evaluators.space import dissimilarities_and_vectors, squared_bet
 
 DEFAULT_SHORTLIST = 10
 _LARGEST_DISSIMILARITY = 1e15
-# Without those that read all encodings or more
-_INDEXED_RELEVANCES = frozenset(Relevance) - {Relevance.SIMBAD, Relevance.BRUTE_FORCE}
 # Bounds of what `is_short`
 _MOST_IMAGES = 1 << 15
 _MOST_SUMMED = 1 << 18  # entries of lists
@@ -157,10 +155,9 @@ def is_short(snapshot: Map, view: View, n_shortlist: int | None = None) -> bool:
         if not is_plain or view.values.size * n_landmarks > _MOST_PRODUCTS:
             return False
     n_summed = snapshot.list_length * max(snapshot.n_images, n_landmarks)
-    is_listed = (
-        snapshot.relevance in _INDEXED_RELEVANCES and n_summed <= _MOST_SUMMED and snapshot.n_images <= _MOST_IMAGES
-    )
-    return is_listed and (n_shortlist or 0) <= _LONGEST_SHORTLIST
+    is_listed = snapshot.values is None and snapshot.encodings is None  # else all of them are read, or more
+    is_small = n_summed <= _MOST_SUMMED and snapshot.n_images <= _MOST_IMAGES
+    return is_listed and is_small and (n_shortlist or 0) <= _LONGEST_SHORTLIST
 
 
 def describe(snapshot: Map, evaluator: Evaluator, view: View) -> Query:

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.localizer import View, describe, is_short
 from deepsimbad.engine.maps import MappedDomain, Maps
@@ -48,8 +47,6 @@ from deepsimbad.store.sessions import JournalRow, ListedSession, ObservedRow, Pr
 T = TypeVar("T")
 
 DELETED, EXPIRED = "deleted", "expired"
-_ENCODING_RELEVANCES = {Relevance.COMPOSED, Relevance.BRUTE_FORCE}  # relevances that compare encodings
-_DISSIMILARITY_RELEVANCES = {Relevance.COMPOSED, Relevance.SIMBAD}  # and dissimilarities
 _LONGEST_RETRY_S = 60
 
 
@@ -401,9 +398,9 @@ class Sessions:
             snapshot.check_landmark_model(observation.landmark_models)
         query = describe(snapshot, state.engine.evaluator, view)
         watch.lap("describe")
-        relevance = snapshot.relevance
-        encoding = query.encoding if relevance in _ENCODING_RELEVANCES else None
-        has_dissimilarities = encoding is None and relevance in _DISSIMILARITY_RELEVANCES
+        traits = snapshot.relevance.traits
+        encoding = query.encoding if traits.compares_encodings else None
+        has_dissimilarities = encoding is None and traits.compares_dissimilarities
         row = ObservedRow(  # what the map's relevance compares, and no more
             sequence=state.sequence + 1,
             expires_at=expires_at,

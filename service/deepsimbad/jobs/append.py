@@ -140,7 +140,7 @@ def known_drives(
         read: Reads a traverse of the domain.
     """
     record = catalog.map(domain.name, domain.active_version or 0)
-    if map_.relevance is not Relevance.COMPOSED:
+    if not map_.relevance.traits.compares_unit_vectors:
         return f"places are fused in maps for composed alone, and this one is for {map_.relevance}"
     names, landmarks = seasons_in(record.config, record.metrics), record.config["landmark_traverse"]
     stored_names = Traverse.list(catalog.data_dir, domain.name)

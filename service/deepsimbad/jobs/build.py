@@ -19,7 +19,7 @@ from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.experience.training import LearningCurve, TrainingWorld, train
 from deepsimbad.core.frames import Camera
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.relevance import Query
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidSceneError, InvalidSourceError
 from deepsimbad.evaluators.base import Evaluator, Fitted, Image, LandmarkModel
@@ -268,7 +268,7 @@ def build(
     """
     if second is not None and np.array_equal(second.encodings, training.encodings):
         second = None  # one drive under two names is one season
-    if plan.relevance is Relevance.COMPOSED and evaluator.is_squared_l2:
+    if plan.relevance.traits.compares_unit_vectors and evaluator.is_squared_l2:
         return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera, evaluator.halves)
     candidates = training if landmarks is None else landmarks
     fit: Fitted | None = None
@@ -284,7 +284,7 @@ def build(
     def on_build_progress(share: float) -> None:
         on_progress((1 + share) / 2)
 
-    if plan.relevance is Relevance.COMPOSED:
+    if plan.relevance.traits.compares_unit_vectors:
         map_build = _composed_in_space(
             plan, training, second, landmarks, model, n_landmarks, evaluator, on_build_progress, camera
         )

@@ -28,7 +28,8 @@ _VIEWS_SHARE, _FIT_SHARE = 0.1, 0.6  # of progress: landmarks chosen, their view
 
 def fitting_of(evaluator: Evaluator, relevance: Relevance) -> Fitting:
     """What an evaluator is fitted to for maps of a relevance: nothing where `composed` compares encodings by L2."""
-    return Fitting.NOTHING if relevance is Relevance.COMPOSED and evaluator.is_squared_l2 else evaluator.fitting
+    has_none = relevance.traits.compares_unit_vectors and evaluator.is_squared_l2
+    return Fitting.NOTHING if has_none else evaluator.fitting
 
 
 class Pictures(Protocol):

@@ -18,7 +18,6 @@ from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.frames import Camera
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Relevance
 from deepsimbad.errors import (
     InvalidEncodingError,
     InvalidMapConfigError,
@@ -309,7 +308,7 @@ class _Remap:
             )
         q_values = learning = None
         # The baseline that compares whole encodings would need hours for it, and serves no robot.
-        if config.training_episodes and config.relevance is not Relevance.BRUTE_FORCE:
+        if config.training_episodes and config.relevance.traits.is_listed:
             self.progress.stage("train")
             q_values, learning = train_nnql(
                 map_build.rehearsal,

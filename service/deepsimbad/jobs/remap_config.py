@@ -75,7 +75,7 @@ class RemapConfig:
             raise InvalidMapConfigError(
                 "a map finds the frames it was made of at once: give another check_traverse, or none to hold frames out"
             )
-        if self.camera_of is not None and (self.append or self.relevance is not Relevance.COMPOSED):
+        if self.camera_of is not None and (self.append or not self.relevance.traits.compares_unit_vectors):
             raise InvalidMapConfigError("camera_of is for maps that are made anew, for the relevance composed")
         if self.append and self.landmark_traverse is not None:
             raise InvalidMapConfigError(
@@ -106,7 +106,7 @@ def remap_stages(
     n, m, dim = n_frames, n_candidates, encoding_dim
     n_landmarks = config.n_landmarks or min(DEFAULT_N_LANDMARKS, m or DEFAULT_N_LANDMARKS)
     n_episodes = min(config.training_episodes, EPISODES_A_MAP_IMAGE * n)
-    if config.append or config.relevance is Relevance.BRUTE_FORCE:
+    if config.append or not config.relevance.traits.is_listed:
         n_episodes = 0
     fit_s = {Fitting.NOTHING: 0.0, Fitting.ENCODINGS: 10.0, Fitting.IMAGES: 10.0 + 0.3 * n_landmarks}[fitting]
     return {
@@ -171,7 +171,7 @@ def staying_map(config: RemapConfig, active: Map) -> Map | None:
 
     Raises InvalidMapConfigError: another number of landmarks is asked for.
     """
-    if not config.append and is_composed(active.landmark_model) != (config.relevance is Relevance.COMPOSED):
+    if not config.append and is_composed(active.landmark_model) != config.relevance.traits.compares_unit_vectors:
         return None
     if config.n_landmarks not in {None, active.n_landmarks}:
         raise InvalidMapConfigError(

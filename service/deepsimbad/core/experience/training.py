@@ -14,7 +14,7 @@ from deepsimbad.core.experience.lattice import NO_MOVE, Lattice, Moves, moves_al
 from deepsimbad.core.experience.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
 from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import LiveStatistics, Query, Relevance, UpdateRule, mean_ranks
+from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule, mean_ranks
 from deepsimbad.core.route import Route
 
 EPISODES_A_POINT = 100  # a point of the learning curve
@@ -45,9 +45,7 @@ class TrainingWorld:
         actions_m = map_.actions_m
         lattice = Lattice.of_route(map_.route, actions_m)
         stds_m = [motion_std_m(m) if config.motion_std_m is None else config.motion_std_m for m in actions_m.tolist()]
-        if (
-            map_.relevance is Relevance.COMPOSED
-        ):  # compared by dissimilarities, which were measured once for all episodes
+        if map_.relevance.traits.compares_dissimilarities:  # which were measured once for all episodes
             views = replace(views, encoding=None)
         return cls(
             map_,

@@ -20,7 +20,7 @@ from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, Localize
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import mean_interval, rank_of_truth
 from deepsimbad.core.planners import CONSTANT, DEFAULT_PLANNER, NNQL, RANDOM
-from deepsimbad.core.relevance import DEFAULT_RELEVANCE, DEFAULT_UPDATE, Query, Relevance, UpdateRule
+from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query, Relevance, UpdateRule
 from deepsimbad.core.route import Route
 from deepsimbad.errors import InvalidMapConfigError
 from deepsimbad.evaluators.base import Evaluator
@@ -151,7 +151,7 @@ class NbvConfig:
     n_landmarks: int = 300  # r
     list_length: int = 4  # h
     relevance: Relevance = DEFAULT_RELEVANCE  # of our set-up, as `update`; the paper's is measured beside it
-    update: UpdateRule = DEFAULT_UPDATE[DEFAULT_RELEVANCE]
+    update: UpdateRule = DEFAULT_RELEVANCE.traits.update
     actions_m: tuple[float, ...] = tuple(float(metres) for metres in range(1, 11))  # the moves
     n_steps: int = 10  # moves an episode
     training_episodes: int = 10_000  # of NNQL

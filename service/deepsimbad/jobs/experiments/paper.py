@@ -169,7 +169,7 @@ class Pair:
             self._relisted_builds[list_length] = {
                 name: replace(map_build, map=relisted_map(map_build, list_length))
                 for name, map_build in self._map_builds.items()
-                if name is not Relevance.BRUTE_FORCE  # which has no lists
+                if name.traits.is_listed
             }
         return self._relisted_builds[list_length]
 
@@ -202,7 +202,7 @@ class Pair:
             "index_bits": {
                 name.value: bits_per_map_image(map_build.map)
                 for name, map_build in map_builds.items()
-                if is_main_length and name is not Relevance.BRUTE_FORCE
+                if is_main_length and name.traits.is_listed
             },
         }
 

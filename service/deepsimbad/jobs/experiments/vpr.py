@@ -98,7 +98,7 @@ def vpr_stages(config: VprConfig) -> dict[str, float]:
     """The stages `run_vpr` reports, with their weights."""
     return (
         {"describe": 3.0}
-        | {f"query by {name.value}": 3.0 if name is Relevance.BRUTE_FORCE else 1.0 for name in config.relevances}
+        | {f"query by {name.value}": 1.0 if name.traits.is_listed else 3.0 for name in config.relevances}
         | ({"drive": 10.0} if _is_driven(config) else {})
     )
 
@@ -171,14 +171,14 @@ def build_maps(
         plan = MapPlan(
             name, config.list_length, ACTIONS_M, same_route=config.same_route, bars_own_place=config.bar_own_place
         )
-        landmark_source = landmarks if name is Relevance.COMPOSED or model is None else model
+        landmark_source = landmarks if name.traits.compares_unit_vectors or model is None else model
         share = number / len(config.relevances)
         map_builds[name] = build(
             *(plan, training, landmarks, landmark_source, config.n_landmarks, evaluator),
             lambda build_share, share=share: on_progress(share + build_share / len(config.relevances)),  # type: ignore[misc]
             fitter=fitter,
         )
-        if name is not Relevance.COMPOSED:
+        if not name.traits.compares_unit_vectors:
             model = map_builds[name].map.landmark_model
     return map_builds
 
@@ -186,11 +186,7 @@ def build_maps(
 def relisted_map(map_build: Built, list_length: int) -> Map:
     """The map with lists of another length and landmarks moved for them, which is all that single views need."""
     map_ = map_build.map
-    if (
-        map_.relevance is Relevance.COMPOSED
-        and map_build.places is not None
-        and map_build.initial_landmarks is not None
-    ):
+    if map_build.places is not None and map_build.initial_landmarks is not None:
         prototypes = learnt_landmarks(map_build.places, map_build.initial_landmarks, list_length)
         lists = compose(map_build.places, prototypes, list_length)
         return replace(map_, lists=lists, landmark_model={**map_.landmark_model, "prototypes": prototypes})
@@ -246,7 +242,7 @@ def score_maps(
         views, moved_m = test.by(map_.landmark_model), moves_between(test.drive)
         live = None if config.stateless else map_.live_statistics
         keep(name.value, _relevances_in_order(map_, views, live, moved_m, progress.update))
-        if name is Relevance.COMPOSED and bound:
+        if name.traits.compares_unit_vectors and bound:
             keep(BRUTE_FORCE_U, relevances_by_all(map_builds[name], views, moved_m, config.stateless))
     return scores
 
@@ -289,7 +285,7 @@ def _relevances_in_order(
 ) -> Iterator[NDArray[np.float32]]:
     """Yield the relevances [n] to every view in order."""
     # Without a session's statistics every view is compared by itself; many at once are one matrix product.
-    size = _QUERIES_A_BLOCK if map_.relevance is Relevance.BRUTE_FORCE else 1
+    size = 1 if map_.relevance.traits.is_listed else _QUERIES_A_BLOCK
     for first in range(0, len(moved_m), size):
         query = views.at(slice(first, first + size) if size > 1 else first)
         if live is not None:
