@@ -172,6 +172,16 @@ def test_a_route_ends_where_it_ends_within_the_error_of_a_move(client, belief):
         assert see(client, path, 39, action_m)["belief"]["mode_m"] == 78
 
 
+def test_near_the_end_a_move_that_stays_is_recommended_and_where_none_does_it_is_said(client):
+    warning = "every move probably leads past the end of the mapped route"
+    near_end, at_end = (
+        see(client, client.session(start_position_m=start_m, start_std_m=0.2), image)
+        for start_m, image in ((76, 38), (78, 39))
+    )
+    assert near_end["belief"]["mode_m"] + near_end["next_best_view"]["action_m"] <= 78
+    assert (warning in near_end["warnings"], warning in at_end["warnings"]) == (False, True)
+
+
 def test_a_move_backward_within_its_error_is_none(client):
     beliefs = []
     for action_m in (0, -0.39):

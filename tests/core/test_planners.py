@@ -91,7 +91,33 @@ def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away):
 def test_where_nobody_knows_what_views_tell_it_goes_far():
     plan = plan_by_information(view_of(sharp(3)))
     assert (plan.action_m, plan.values) == (10, None)
-    assert plan_by_information(view_of(sharp(3), actions_m=np.array([-4.0, 0.0, 1.0]))).action_m == -4
+    assert plan_by_information(view_of(sharp(40), actions_m=np.array([-4.0, 0.0, 1.0]))).action_m == -4
+
+
+@pytest.mark.parametrize("known_bits", [True, False])
+@pytest.mark.parametrize(
+    ("place", "actions_m", "expected_m"),
+    [
+        (N_IMAGES - 1 - 4, (1.0, 4.0, 10.0), 4),
+        (N_IMAGES - 1, (-3.0, 1.0, 10.0), -3),
+        (2, (-3.0, -2.0, 1.0), -2),
+        (2, (-9.0, 0.0), 0),
+    ],
+)
+def test_no_move_leads_past_an_end_while_another_stays(place, actions_m, expected_m, known_bits):
+    flat = np.ones(N_IMAGES, np.float32) if known_bits else None
+    plan = plan_by_information(view_of(sharp(place), flat, actions_m=np.array(actions_m)))
+    assert plan.action_m == expected_m
+    assert plan.chance_on_route > 0.97
+
+
+def test_where_every_move_leads_past_the_end_it_is_the_one_that_most_probably_stays():
+    mass = np.zeros(N_IMAGES)
+    mass[[-12, -3, -1]] = 0.2, 0.2, 0.6
+    plan = plan_by_information(view_of(mass, np.ones(N_IMAGES, np.float32), actions_m=np.array([1.0, 10.0])))
+    assert (plan.action_m, plan.chance_on_route) == (1, pytest.approx(0.4))
+    plan = plan_by_information(view_of(sharp(N_IMAGES - 1), actions_m=np.array([1.0, 10.0]), closed=True))
+    assert (plan.action_m, plan.chance_on_route) == (10, pytest.approx(1))
 
 
 def test_moves_are_weighed_by_the_whole_belief_and_ties_go_far(bits):

@@ -35,7 +35,7 @@ from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE, BeliefSummary
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.on_board import RANKS, UNIT_ENCODING
-from deepsimbad.core.planners import Plan
+from deepsimbad.core.planners import PROBABLY, Plan
 from deepsimbad.engine.localizer import (
     Dissimilarities,
     Localization,
@@ -226,7 +226,7 @@ def render_localization(
         "map_version": snapshot.version,
         "belief": render_belief(snapshot, localization.belief, is_confident),
         "informative": localization.is_informative,
-        "warnings": [*remarks, *warnings_of(localization.is_informative, localization.belief)],
+        "warnings": [*remarks, *warnings_of(localization.is_informative, localization.belief, localization.plan)],
         "retrieval": render_shortlist(snapshot, localization.shortlist, relevance),
         "next_best_view": render_plan(localization.plan, snapshot.actions_m, is_confident),
         "timings_ms": watch.timings_ms(),
@@ -255,11 +255,13 @@ def render_plan(plan: Plan | None, actions_m: NDArray[np.float64], is_confident:
     return {"planner": plan.planner, "action_m": plan.action_m, "stop": is_confident, "actions": actions}
 
 
-def warnings_of(is_informative: bool, belief: BeliefSummary) -> list[str]:
+def warnings_of(is_informative: bool, belief: BeliefSummary, plan: Plan | None) -> list[str]:
     """Warnings for a person, in sentences, about an answer."""
     warnings = [] if is_informative else ["the view told nothing of the place"]
     if belief.off_route > WARNING_PROBABILITY:
         warnings.append(f"the robot is probably off the route, or was carried: off_route is {belief.off_route:.2f}")
+    elif plan is not None and plan.chance_on_route < PROBABLY:
+        warnings.append("every move probably leads past the end of the mapped route")
     return warnings
 
 

@@ -220,7 +220,7 @@ def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer
     return {
         **render_session(view),
         "informative": view.is_informative,
-        "warnings": [*view.remarks, *warnings_of(view.is_informative, view.belief)],
+        "warnings": [*view.remarks, *warnings_of(view.is_informative, view.belief, view.plan)],
         "retrieval": retrieval,
         "timings_ms": watch.timings_ms(),
     }

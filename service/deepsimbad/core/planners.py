@@ -21,6 +21,7 @@ NNQL_NEIGHBOURS = 4  # k of the paper
 _DISCOUNT, _SWEEPS = 0.9, 60
 _IMAGES_AT_ONCE = 256  # few enough for single precision
 _LEAST_MASS = 1e-6  # of a belief; a block of images that holds less is left out of its averages
+PROBABLY = 0.5  # of a move to end on the route: with less another one is taken
 _MOST_PRICES = 8  # whose tables a map keeps: one of 26,000 images takes 2 MB
 
 
@@ -46,6 +47,7 @@ class Plan:
     values: NDArray[np.float64] | None = None
     # [a] bits that the view after every move is expected to tell; None where nobody knows
     bits: NDArray[np.float64] | None = None
+    chance_on_route: float = 1.0  # of the move to end on an open route; 1 where the planner does not ask
 
 
 Planner: TypeAlias = Callable[[PlanningView], Plan | None]
@@ -73,14 +75,24 @@ def plan_by_experience(view: PlanningView) -> Plan | None:
 def plan_by_information(view: PlanningView) -> Plan:
     """The move whose views ahead tell most bits on average over the belief (ours); of equals the longer, forward one.
 
-    Where nobody knows what views tell it is the longest move.
+    Where nobody knows what views tell it is the longest move. A move that more probably leads past an end of the route
+    than not is taken only where all do; then it is the one that most probably stays.
     """
     actions_m = view.map.actions_m
     table = information_ahead(view.map, view.price_bits_per_m)
     averages = np.zeros(2 * actions_m.size) if table is None else _averaged(view.mass, table.T)
     values, bits = averages[: actions_m.size], averages[actions_m.size :]
-    *_, best_m = max(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True))
-    return Plan(INFORMED, best_m) if table is None else Plan(INFORMED, best_m, values, bits)
+    moves = sorted(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True), reverse=True)
+    best_m, best_chance = 0.0, -1.0
+    for *_, action_m in moves:
+        chance = float(view.mass[view.map.route.staying(action_m)].sum())
+        if chance > best_chance:
+            best_m, best_chance = action_m, chance
+        if best_chance >= PROBABLY:
+            break
+    if table is None:
+        return Plan(INFORMED, best_m, chance_on_route=best_chance)
+    return Plan(INFORMED, best_m, values, bits, best_chance)
 
 
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:

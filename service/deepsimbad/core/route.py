@@ -17,6 +17,7 @@ _NearPoint = Callable[[float, float], NDArray[np.intp]]
 _HISTOGRAM_BINS = 200
 _EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563  # of the Earth's ellipsoid, WGS 84
 _LEAST_LENGTH_M = 1e-9  # on a shorter route moves counted in its steps would overflow
+_ROUNDING_M = 1e-9  # by which a position past an end is taken for the end
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,16 @@ class Route:
 
     def reaches(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether positions are on the route; those past the ends of an open one are not, but for rounding."""
-        inside = (position_m >= self.start_m - 1e-9) & (position_m <= self.position_m[-1] + 1e-9)
+        inside = (position_m >= self.start_m - _ROUNDING_M) & (position_m <= self.position_m[-1] + _ROUNDING_M)
         return np.asarray(inside | self.closed)
+
+    def staying(self, action_m: float) -> slice:
+        """The map images from which a move ends on the route, as `reaches` has it."""
+        if self.closed:
+            return slice(0, self.n_images)
+        ends_m = self.start_m - _ROUNDING_M, self.position_m[-1] + _ROUNDING_M
+        first = int(np.searchsorted(self.position_m, ends_m[0] - action_m))
+        return slice(first, max(first, int(np.searchsorted(self.position_m, ends_m[1] - action_m, side="right"))))
 
     @cached_property
     def places(self) -> Places:
