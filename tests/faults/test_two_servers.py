@@ -32,14 +32,15 @@ def test_the_second_refuses_before_it_listens(data_dir: Path, tmp_path: Path) ->
     check_is_clean(data_dir)
 
 
-def test_nothing_is_acknowledged_into_a_file_that_is_gone(data_dir: Path) -> None:
+@pytest.mark.parametrize("name", ["sessions.sqlite", "sessions.sqlite-wal"])
+def test_nothing_is_acknowledged_into_a_file_that_is_gone(data_dir: Path, name: str) -> None:
     with Service(data_dir) as service:
         session_id = begin(service)
-        (data_dir / "sessions.sqlite").unlink()
+        (data_dir / name).unlink()
         for request in (service.observe(session_id, 3), {"path": "/v1/domains/loop/sessions", "json": {}}):
             problem = service.problem_of("POST", **request)
             assert (problem["status"], problem["code"]) == (503, "damaged_file")
-            assert "sessions.sqlite was removed under the running service" in problem["detail"]
+            assert f"{name} was removed under the running service" in problem["detail"]
         give_up = time.monotonic() + 120
         while service.ask("GET", "/readyz").status_code != 503:  # it looks once a second
             assert time.monotonic() < give_up

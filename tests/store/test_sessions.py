@@ -185,15 +185,26 @@ def test_living_sessions_are_listed_page_by_page_newest_first(store: SessionStor
     assert (entry.n_observations, entry.session.n_events, entry.session.expires_at) == (2, 3, 400.0)
 
 
-def test_sessions_that_were_removed_meanwhile_take_no_more(store: SessionStore, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["sessions.sqlite", "sessions.sqlite-wal"])
+def test_sessions_that_were_removed_meanwhile_take_no_more(store: SessionStore, tmp_path: Path, name: str) -> None:
     number = store.create(RECORD).result().number
-    (tmp_path / "sessions.sqlite").unlink()
-    with pytest.raises(DamagedFileError, match="was removed under the running service"):
+    assert store.find("s1").n_events == 0
+    (tmp_path / name).unlink()
+    with pytest.raises(DamagedFileError, match=f"{name} was removed under the running service"):
         store.append(number, observed(1), 1.0).result()
-    (tmp_path / "sessions.sqlite").touch()  # another one of its name is none
+    (tmp_path / name).touch()  # another one of its name is none
     with pytest.raises(DamagedFileError, match="was removed"):
         store.try_writing().result()
     assert store.find("s1").n_events == 0
+
+
+def test_an_ordered_end_writes_what_a_removed_log_held(store: SessionStore, tmp_path: Path) -> None:
+    number = store.create(RECORD).result().number
+    store.append(number, observed(1), 1.0).result()
+    (tmp_path / "sessions.sqlite-wal").unlink()
+    store.close()
+    with SessionStore.open(tmp_path) as reopened_store:
+        assert reopened_store.find("s1").n_events == 1
 
 
 # Group commit

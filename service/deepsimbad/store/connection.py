@@ -165,6 +165,9 @@ class OpenFile:
         self._reader = reader or db
         self._reader_lock = threading.RLock() if reader else self._lock
         self._inode = path.stat().st_ino
+        self._log = path.with_name(f"{path.name}-wal")
+        # SQLite removes its log only when the last connection closes, and this one is open.
+        self._log_inode = _inode(self._log)
 
     def close(self) -> None:
         """Close the file; where readers have their own connection its log, empty, stays.
@@ -206,17 +209,30 @@ class OpenFile:
         self.check_is_there()
 
     def check_is_there(self) -> None:
-        """Raise `_removal_error` where the file is gone or another lies in its place: an open file would not notice."""
+        """Raise an error where the file or its log is gone or replaced, which whoever has it open would not notice.
+
+        `_removal_error` for the file; DamagedFileError for the log, without which a crash would lose commits.
+        """
         with storage_faults(self._path):
-            try:
-                is_there = self._path.stat().st_ino == self._inode
-            except FileNotFoundError:
-                is_there = False
-        if not is_there:
-            raise self._removal_error()
+            if _inode(self._path) != self._inode:
+                raise self._removal_error()
+            if _inode(self._log) != self._log_inode:
+                raise _removed_file(self._log)
 
     def _removal_error(self) -> DeepSimbadError:
-        return DamagedFileError(f"{self._path.name} was removed under the running service", file=self._path.name)
+        return _removed_file(self._path)
+
+
+def _inode(path: Path) -> int | None:
+    """The inode of a file; None where there is none."""
+    try:
+        return path.stat().st_ino
+    except FileNotFoundError:
+        return None
+
+
+def _removed_file(path: Path) -> DamagedFileError:
+    return DamagedFileError(f"{path.name} was removed under the running service", file=path.name)
 
 
 class GroupCommit:
