@@ -15,12 +15,13 @@ from deepsimbad.errors import (
     DomainDiffersError,
     InvalidArchiveError,
     InvalidInputError,
+    InvalidMapConfigError,
     NoActiveMapError,
     RetiredMapError,
     UnavailableError,
     UnknownMapVersionError,
 )
-from deepsimbad.jobs.versions import import_map
+from deepsimbad.jobs.versions import import_map, seal_version
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import export_map, seal, write_map
@@ -101,6 +102,17 @@ def test_the_active_version_and_the_old_name_unless_told(exported, importer):
     assert importer.domain("campus").active_version == 1
     assert importer.map("campus", 2).state is MapState.SEALED
     assert importer.map("campus", 1).config["imported"]["version"] == 2
+
+
+def test_a_map_that_makes_no_sense_is_neither_sealed_nor_served(importer):
+    importer.create_domain("campus", EVALUATOR, False, ACTIONS_M)
+    position_m = np.full(30, 4.0)
+    with pytest.raises(InvalidMapConfigError, match="at one position"):
+        seal_version(importer, "campus", contents("campus", 1, position_m=position_m), {}, {}, lambda _: None, None)
+    assert importer.maps("campus") == []
+    add(importer, "campus", position_m=position_m)  # as another machine could
+    with pytest.raises(DamagedMapError):
+        Maps(importer).active("campus")
 
 
 def test_an_export_is_refused_by_name(exporter, tmp_path):

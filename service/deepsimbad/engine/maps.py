@@ -403,7 +403,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
     Raises:
         UnknownMapVersionError: No such version.
         RetiredMapError: Its file was removed.
-        DamagedMapError: The file is missing, fails its digest or contradicts itself.
+        DamagedMapError: The file is missing, fails its digest, contradicts itself or makes no sense (`Map.check`).
         UnavailableError: The disk failed, no memory is left, ...: the file may be whole.
     """
     record = catalog.map(domain, version)
@@ -415,6 +415,7 @@ def load_snapshot(catalog: Catalog, domain: str, version: int) -> Map:
             # A map moved here from another server says in its file what it was called there.
             snapshot = replace(read_map(path), domain=domain, version=version)
             _ = snapshot.relevance  # without one it can answer nothing
+            snapshot.check()  # it may come from a map store, to which others write
             return snapshot
     except (DeepSimbadError, KeyError, TypeError, ValueError) as error:
         answer = unreadable_error(catalog, domain, version)

@@ -58,7 +58,10 @@ def seal_version(
         metrics: What was measured; the size of the index is added, and the job's id, by which a job that was
             interrupted finds what it made (`Catalog.map_of_job`).
         on_progress: Called with the share written; may raise to cancel.
+
+    Raises InvalidMapConfigError: the map makes no sense (`Map.check`).
     """
+    map_.check()
     version = catalog.begin_map(domain, dict(config))
     try:
         building, sealed_path = catalog.building_path(domain, version), catalog.map_path(domain, version)
