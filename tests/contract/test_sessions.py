@@ -191,6 +191,7 @@ def test_a_move_backward_within_its_error_is_none(client):
     assert beliefs[0] == beliefs[1]
     problem(observe(client, path, "-0.41&action_std_m=0.1"), 422, "invalid_move")
     assert client.get(path).json()["n_observations"] == 2
+    assert observe(client, path, "1&action_std_m=0").status_code == 200, "a move may be exact"
 
 
 # How sure, and what to do about it

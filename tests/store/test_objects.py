@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from deepsimbad.errors import MissingPackageError, SettingsError, UnavailableError
+from deepsimbad.store import objects as objects_module
 from deepsimbad.store.objects import Objects
 from tests.store.bucket import Bucket, served_bucket
 
@@ -50,6 +51,15 @@ def test_an_object_is_written_whole_and_read_as_it_was(objects: Objects, tmp_pat
     for _ in range(2):
         objects.delete("domains/b")
         assert objects.get("domains/b") is None
+
+
+def test_what_was_written_in_a_folder_outlives_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objects, synced_paths = Objects.open(f"file://{tmp_path}/store"), []
+    monkeypatch.setattr(objects_module, "sync", synced_paths.append)
+    for write in (objects.create, objects.put):
+        assert write("log/1", b"1") is not False
+        assert synced_paths == [tmp_path / "store/log/1", tmp_path / "store/log"]
+        synced_paths.clear()
 
 
 def test_of_many_who_create_an_object_at_once_one_does(objects: Objects) -> None:

@@ -26,7 +26,7 @@ from deepsimbad.store import map_store, shared_catalog
 from deepsimbad.store.backup import back_up, inspect, restore
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
-from deepsimbad.store.layout import map_path
+from deepsimbad.store.layout import domains_folder, map_path
 from deepsimbad.store.map_file import read_map, seal, write_map
 from deepsimbad.store.records import MapRecord, MapState
 from deepsimbad.store.shared_catalog import SharedCatalog, inspect_objects, open_catalog
@@ -282,7 +282,11 @@ def test_a_new_node_begins_with_all_domains_in_one_object(
     names = []
     parse = map_store._parse
     monkeypatch.setattr(map_store, "_parse", lambda content, name: names.append(name) or parse(content, name))
-    node_b = node("there")
+    with monkeypatch.context() as patch:
+        synced_paths, sync = [], shared_catalog.sync
+        patch.setattr(shared_catalog, "sync", lambda path: synced_paths.append(path) or sync(path))
+        node_b = node("there")
+    assert synced_paths == [domains_folder(node_b.data_dir)], "the log is not read again for what a power cut takes"
     assert node_b.domains() == node_a.domains()
     assert names[1:] == ["state.json.gz", "log/000000000005.json"]
     for version, state in ((1, MapState.RETIRED), (2, MapState.ACTIVE)):  # sessions may live on the first
