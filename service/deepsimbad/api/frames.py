@@ -8,8 +8,7 @@ from typing import IO, Annotated, Any
 import numpy as np
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Path, Query, Request, Response
-from numpy.typing import NDArray
-from pydantic import FailFast, Field, StrictFloat
+from pydantic import BaseModel, FailFast, Field, StrictFloat
 
 from deepsimbad.api.localizations import IMAGE_SCHEMA, list_schema
 from deepsimbad.api.problems import binary, declare, invalid_body, problems
@@ -31,16 +30,15 @@ from deepsimbad.api.scenes import MOST_PARTS, SCENE_BODIES, SCENE_MEMBERS, SCENE
 from deepsimbad.api.traverses import TraverseName
 from deepsimbad.core.drive import FRAME_NAME, Drive
 from deepsimbad.core.frames import MAX_POSITION_M, Camera, content_digest
-from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.distant import encoded
 from deepsimbad.engine.localizer import ready_encodings
 from deepsimbad.engine.traverses import read_batch
-from deepsimbad.engine.worker import EncodedImage, Priority
+from deepsimbad.engine.worker import Priority
 from deepsimbad.errors import EmptyBodyError, GreyLevelsDifferError, InvalidInputError
 from deepsimbad.evaluators.base import Fitting
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
-from deepsimbad.evaluators.scenes import Scene, check_whole
+from deepsimbad.evaluators.scenes import check_whole
 from deepsimbad.store.durable import storage_faults
 
 router = APIRouter(
@@ -69,6 +67,40 @@ _ENCODING_SCHEMA = list_schema(
 _FRAME_SCHEMA = {"oneOf": [_ENCODING_SCHEMA, SCENE_SCHEMA]}
 
 
+def _metres(description: str) -> Any:
+    return Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description=description)
+
+
+Replace = Annotated[
+    bool,
+    Query(description="false: a frame that is there already and differs is a 409 `frames_differ`, an equal one stays."),
+]
+
+
+class FrameQuery(BaseModel):
+    """The place of a frame, and how it is stored."""
+
+    position_m: Annotated[float, _metres("Metres along the route.")]
+    timestamp_us: Annotated[
+        int | None, Field(ge=0, le=GREATEST_EXACT_INTEGER, description="Microseconds since 1970.")
+    ] = None
+    x_m: Annotated[float | None, _metres("East, in metres.")] = None
+    y_m: Annotated[float | None, _metres("North, in metres.")] = None
+    frame_name: Annotated[
+        str | None,
+        Field(alias="name", pattern=f"^{FRAME_NAME}$", description="As answers show it; the file's, in a recording."),
+    ] = None
+    camera: Annotated[str | None, Field(pattern=f"^{FRAME_NAME}$", description="What took the picture, as `Cam5`.")] = (
+        None
+    )
+    replace: Replace = True
+
+    def columns(self, index: int) -> dict[str, Any]:
+        """What is known of the frame, as the arrays [1] of a drive."""
+        place = self.model_dump(exclude={"camera", "replace"}, exclude_none=True)
+        return {key: np.array([value]) for key, value in {"index": index, **place}.items()}
+
+
 class FrameAnswer(Answer):
     """A frame has been stored."""
 
@@ -86,15 +118,6 @@ class BatchAnswer(Answer):
 
 # Handlers
 
-Replace = Annotated[
-    bool,
-    Query(description="false: a frame that is there already and differs is a 409 `frames_differ`, an equal one stays."),
-]
-
-
-def _metres(description: str) -> Any:
-    return Query(ge=-MAX_POSITION_M, le=MAX_POSITION_M, allow_inf_nan=False, description=description)
-
 
 @router.put(
     "/{index}",
@@ -109,23 +132,10 @@ async def put_frame(
     domain: DomainName,
     name: TraverseName,
     index: Annotated[int, Path(ge=0, le=GREATEST_EXACT_INTEGER, description="Place in the recording, from 0.")],
-    position_m: Annotated[float, _metres("Metres along the route.")],
+    query: Annotated[FrameQuery, Query()],
     request: Request,
     response: Response,
     services: RunningServices,
-    timestamp_us: Annotated[
-        int | None, Query(ge=0, le=GREATEST_EXACT_INTEGER, description="Microseconds since 1970.")
-    ] = None,
-    x_m: Annotated[float | None, _metres("East, in metres.")] = None,
-    y_m: Annotated[float | None, _metres("North, in metres.")] = None,
-    frame_name: Annotated[
-        str | None,
-        Query(alias="name", pattern=f"^{FRAME_NAME}$", description="As answers show it; the file's, in a recording."),
-    ] = None,
-    camera: Annotated[
-        str | None, Query(pattern=f"^{FRAME_NAME}$", description="What took the picture, as `Cam5`.")
-    ] = None,
-    replace: Replace = True,
 ) -> FrameAnswer:
     """Store one frame, in any order; the same index again replaces it.
 
@@ -137,65 +147,53 @@ async def put_frame(
     evaluator = services.evaluators.evaluator(record.evaluator)
     levels = await run_sync(_levels_of, services, domain, name)  # an unknown traverse should not cost an upload
     media_type = media_type_of(request, FRAME_TYPES)
-    if media_type == JSON and camera is not None:
+    if media_type == JSON and query.camera is not None:
         raise InvalidInputError("camera is what took a picture, and the body is an encoding: leave it out")
     body = await read_bytes(request)
-    place = {"index": index, "position_m": position_m, "timestamp_us": timestamp_us, "x_m": x_m, "y_m": y_m}
-    columns: dict[str, Any] = {key: np.array([value]) for key, value in place.items() if value is not None}
-    columns |= {} if frame_name is None else {"frame_name": np.array([frame_name])}
+    frame = await parse_json(body, FrameBody, services) if media_type == JSON else FrameBody()
+    members = frame.model_fields_set
 
-    def store(encodings: NDArray[np.float32], picture_bytes: bytes | None = None, **facts: Any) -> tuple[bool, int]:
-        pictures = {} if picture_bytes is None else {index: picture_bytes}
+    def store(pictures: dict[int, bytes], **facts: Any) -> FrameAnswer:
         with services.open_traverses.lend(domain, name) as traverse:
-            n_new, _ = traverse.put_frames(Drive(**columns, encodings=encodings, **facts), replace, pictures)
-            return n_new == 1, traverse.n_frames
+            n_new, _ = traverse.put_frames(Drive(**query.columns(index), **facts), query.replace, pictures)
+            response.status_code = 201 if n_new == 1 else 200
+            return FrameAnswer(index=index, n_frames=traverse.n_frames)
 
-    def store_scene(encoded_image: EncodedImage, shows_nothing: bool, picture: Decoded | None) -> tuple[bool, int]:
-        facts: dict[str, Any] = {}
-        if picture is not None:
-            if record.options.get("thumbnails"):
-                digest = content_digest(np.ascontiguousarray(encoded_image.values, "<f4").tobytes())
-                services.pictures.keep(domain, [(digest, picture.body)])
-            facts = {
-                "picture_bytes": picture.body if evaluator.fitting is Fitting.IMAGES else None,
-                "camera": None if picture.size is None else Camera(*picture.size, camera),
-                "grey_levels": None if picture.is_blank else picture.levels,
-            }
-        return store(
-            encoded_image.values[np.newaxis],
-            weights_sha256=encoded_image.weights_sha256,
-            content_digest=np.array([content_digest(body)], np.uint64),
-            shows_nothing=np.array([shows_nothing]),
-            **facts,
-        )
-
-    async def store_view(document: dict[str, Any], levels: GreyLevels | None) -> tuple[bool, int]:
-        picture: Decoded | None
-        if media_type in MEDIA_TYPES:
-            picture = await services.decoders.decoded(body, evaluator, Priority.BATCH, levels)
-            scene = Scene(image=picture.image)
-        else:
-            scene, picture = await scene_in(body, media_type, document, services, evaluator, Priority.BATCH, levels)
+    async def store_scene(levels: GreyLevels | None) -> FrameAnswer:
+        document = frame.model_dump(include=set(SCENE_MEMBERS))
+        scene, picture = await scene_in(body, media_type, document, services, evaluator, Priority.BATCH, levels)
         check_whole(evaluator, scene)
         encoded_image = await encoded(services.worker, evaluator, scene, Priority.BATCH)
-        return await run_sync(store_scene, encoded_image, scene.is_blank, picture)
+        encodings, pictures = encoded_image.values[np.newaxis], dict[int, bytes]()
+        facts: dict[str, Any] = {"weights_sha256": encoded_image.weights_sha256}
+        if picture is not None:
+            if evaluator.fitting is Fitting.IMAGES:
+                pictures[index] = picture.body
+            if record.options.get("thumbnails"):
+                digest = content_digest(np.ascontiguousarray(encodings, "<f4").tobytes())
+                await run_sync(services.pictures.keep, domain, [(digest, picture.body)])
+            facts["camera"] = None if picture.size is None else Camera(*picture.size, query.camera)
+            facts["grey_levels"] = None if picture.is_blank else picture.levels
+        return await run_sync(
+            lambda: store(
+                pictures,
+                encodings=encodings,
+                content_digest=np.array([content_digest(body)], np.uint64),
+                shows_nothing=np.array([scene.is_blank]),
+                **facts,
+            )
+        )
 
-    frame = await parse_json(body, FrameBody, services) if media_type == JSON else FrameBody()
-    if "encoding" in frame.model_fields_set and len(frame.model_fields_set) == 1:
-        values = np.array(frame.encoding, np.float64)
-        is_new, n_frames = await run_sync(lambda: store(ready_encodings(values[np.newaxis])))
-    elif media_type == JSON and not (frame.model_fields_set and frame.model_fields_set <= SCENE_MEMBERS):
+    if members == {"encoding"}:
+        return await run_sync(lambda: store({}, encodings=ready_encodings(np.array([frame.encoding], np.float64))))
+    if media_type == JSON and not (members and members <= SCENE_MEMBERS):
         raise invalid_body("give encoding; or objects, text, or both")
-    else:
-        members = frame.model_dump(include=set(SCENE_MEMBERS))
-        if evaluator.fitting is Fitting.IMAGES:
-            await run_sync(services.spools.make_room, domain, len(body))
-        try:
-            is_new, n_frames = await store_view(members, levels)
-        except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay
-            is_new, n_frames = await store_view(members, await run_sync(_levels_of, services, domain, name))
-    response.status_code = 201 if is_new else 200
-    return FrameAnswer(index=index, n_frames=n_frames)
+    if evaluator.fitting is Fitting.IMAGES:
+        await run_sync(services.spools.make_room, domain, len(body))
+    try:
+        return await store_scene(levels)
+    except GreyLevelsDifferError:  # another frame came meanwhile, and its levels stay
+        return await store_scene(await run_sync(_levels_of, services, domain, name))
 
 
 @router.get(

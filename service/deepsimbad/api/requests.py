@@ -205,8 +205,8 @@ class StrictRoute(APIRoute):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        fields = get_flat_params(self.dependant)
-        self.queries = tuple(field.alias for field in fields if isinstance(field.field_info, params.Query))
+        fields, other_kinds = get_flat_params(self.dependant), params.Path | params.Header  # a query may be a model
+        self.queries = tuple(field.alias for field in fields if not isinstance(field.field_info, other_kinds))
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer as the framework does, once the query is known to hold no unknown parameter."""

@@ -9,6 +9,7 @@ from deepsimbad.engine.decoders import Decoded
 from deepsimbad.engine.worker import Priority
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import GreyLevels
+from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.evaluators.scenes import FORM_DATA, LONGEST_LABEL, LONGEST_TEXT, MOST_OBJECTS, TEXT, Scene
 
 SCENE_MEMBERS = frozenset({"objects", "text"})  # members of a JSON body
@@ -70,7 +71,9 @@ async def scene_in(
         UnsupportedMediaTypeError: The evaluator does not take it in this form; and as `Decoders.decoded`.
     """
     image: bytes | None = None
-    if media_type == FORM_DATA:
+    if media_type in MEDIA_TYPES:
+        scene, image = Scene(), body
+    elif media_type == FORM_DATA:
         scene, image = Scene.of_form(body)
     else:
         scene = Scene.read(document) if media_type == JSON else Scene.of_body(body, media_type)
