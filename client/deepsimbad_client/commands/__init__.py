@@ -31,9 +31,24 @@ def cli() -> None:
 
 
 COMMANDS = (
-    *(recordings.upload, recordings.localize, recordings.replay, recordings.watch, admin.remap, admin.jobs),
-    *(admin.domains, admin.traverses, admin.sessions, admin.maps, admin.activate, admin.rollback, admin.download),
-    *(admin.delete_domain, admin.delete_traverse, admin.delete_map, admin.delete_session, campus_command),
+    recordings.upload,
+    recordings.localize,
+    recordings.replay,
+    recordings.watch,
+    admin.remap,
+    admin.jobs,
+    admin.domains,
+    admin.traverses,
+    admin.sessions,
+    admin.maps,
+    admin.activate,
+    admin.rollback,
+    admin.download,
+    admin.delete_domain,
+    admin.delete_traverse,
+    admin.delete_map,
+    admin.delete_session,
+    campus_command,
 )
 for command in COMMANDS:
     cli.add_command(command)

@@ -210,7 +210,9 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
     "--training", "--training-traverse", "training_traverse", required=True, metavar="TRAVERSE", help="Becomes the map."
 )
 @click.option(
-    *("--landmarks", "--landmark-traverse", "landmark_traverse"),
+    "--landmarks",
+    "--landmark-traverse",
+    "landmark_traverse",
     metavar="TRAVERSE",
     help="Where landmarks are chosen; absent: the active map's landmarks stay, or, without one, those of the drive.",
 )
@@ -229,12 +231,16 @@ def _show_deleted(json_output: bool, **names: str | int) -> None:
 @click.option("--seed", type=int, help="Equal seeds, equal maps.  [default: 0]")
 @click.option("--activate/--no-activate", default=True, show_default=True, help="Serve the new map at once.")
 @click.option(
-    *("--check", "--check-traverse", "check_traverse"),
+    "--check",
+    "--check-traverse",
+    "check_traverse",
     metavar="TRAVERSE",
     help="Drive that the new map and the active one are compared on; absent: frames held out of the training one.",
 )
 @click.option(
-    *("--gate", "--gate-margin", "gate_margin"),
+    "--gate",
+    "--gate-margin",
+    "gate_margin",
     type=click.FloatRange(min=0),
     metavar="MARGIN",
     help="Serve the new map only if its ANR is worse than the active one's by no more than so many percentage points; "

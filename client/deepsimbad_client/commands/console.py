@@ -224,8 +224,13 @@ def job_table(jobs: Sequence[Job]) -> Table:
     """A table of jobs and how far they are."""
     rows = (
         (
-            *(job.job_id, job.domain, job.state, _minute(job.created_at), _minute(job.finished_at)),
-            *("-" if job.ended else duration_text(job.eta_s), _outcome(job)),
+            job.job_id,
+            job.domain,
+            job.state,
+            _minute(job.created_at),
+            _minute(job.finished_at),
+            "-" if job.ended else duration_text(job.eta_s),
+            _outcome(job),
         )
         for job in jobs
     )
@@ -257,8 +262,12 @@ def session_table(sessions: Sequence[ListedSession]) -> Table:
     """A table of living sessions."""
     rows = (
         (
-            *(session.session_id, session.domain, str(session.map_version), str(session.n_observations)),
-            *(_minute(session.created_at), _minute(session.expires_at)),
+            session.session_id,
+            session.domain,
+            str(session.map_version),
+            str(session.n_observations),
+            _minute(session.created_at),
+            _minute(session.expires_at),
         )
         for session in sessions
     )

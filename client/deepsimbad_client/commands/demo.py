@@ -145,7 +145,10 @@ def _drive_actively(client: Client, live: Recording, folder: Path) -> list[Path]
     _say(f"7. The same from {EPISODES} random starts, against blind moves:")
     with EpisodeBar("driving actively", len(PLANNERS) * EPISODES) as bar:
         active = active_replay(
-            *(client, live, DOMAIN, folder),
+            client,
+            live,
+            DOMAIN,
+            folder,
             planners=PLANNERS,
             episodes=EPISODES,
             steps=steps,

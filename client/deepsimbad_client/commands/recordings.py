@@ -97,7 +97,10 @@ def upload(
         _make_domain(client, domain, recording, closed, evaluator, actions_m)
     with UploadBar(f"{recording.name} to {domain}/{traverse}", len(recording.frames)) as bar:
         report = upload_recording(
-            *(client, recording, domain, traverse),
+            client,
+            recording,
+            domain,
+            traverse,
             concurrency=concurrency,
             replace=replace,
             allow_missing=allow_missing,
@@ -256,7 +259,10 @@ def replay(
             episodes = EPISODES if episodes is None else episodes
             with EpisodeBar(name, len(dict.fromkeys(planners)) * episodes) as bar:
                 active_result = active_replay(
-                    *(client, recording, domain, folder),
+                    client,
+                    recording,
+                    domain,
+                    folder,
                     planners=planners,
                     episodes=episodes,
                     steps=STEPS if steps is None else steps,
@@ -269,7 +275,10 @@ def replay(
         else:
             with ReplayBar(name, len(recording.frames)) as bar:
                 passive_result = passive_replay(
-                    *(client, recording, domain, folder),
+                    client,
+                    recording,
+                    domain,
+                    folder,
                     tolerance_m=TOLERANCE_M if tolerance_m is None else tolerance_m,
                     allow_missing=allow_missing,
                     on_progress=bar,

@@ -268,7 +268,10 @@ def _send_image(
     try:
         image = recording.image(frame, input_size)
         client.admin.put_frame(
-            *(domain, traverse, frame.index, image.body),
+            domain,
+            traverse,
+            frame.index,
+            image.body,
             content_type=image.content_type,
             position_m=frame.position_m,
             timestamp_us=frame.timestamp_us,

@@ -101,7 +101,11 @@ def track_of(
         return None
     x_m, y_m = x_m[rows], y_m[rows]
     return Track(
-        *(times, x_m, y_m, wrapped_rad(heading_rad[rows]), arc_length_m(x_m, y_m, times, deadband_m)),
+        times,
+        x_m,
+        y_m,
+        wrapped_rad(heading_rad[rows]),
+        arc_length_m(x_m, y_m, times, deadband_m),
         n_skipped_rows=int((~usable).sum() + (~rows_on_track).sum()),
         max_gap_s=max(MAX_GAP_S, 5e-6 * float(np.median(np.diff(times)))),
     )

@@ -122,7 +122,11 @@ def paper(
         drives = {season: encoded_drive.drive for season, encoded_drive in encoded_drives.items()}
         progress.stage("measure")
         results = measure_paper(
-            *(config, measure, drives, out / "results", {"evaluator": evaluator.as_dict()}),
+            config,
+            measure,
+            drives,
+            out / "results",
+            {"evaluator": evaluator.as_dict()},
             _with_log(progress.update),
             {season: RecordingPictures(drive, settings.max_pixels) for season, drive in recordings.items()},
         )

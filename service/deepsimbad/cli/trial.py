@@ -111,7 +111,10 @@ def try_(
             }
             with open_encoding_cache(out, role, **ingredients) as encodings:
                 encoded_recordings[role] = encode_recording(
-                    *(recording, measure, settings.max_pixels, progress.update),
+                    recording,
+                    measure,
+                    settings.max_pixels,
+                    progress.update,
                     encoding_cache=encodings,
                     allow_missing=allow_missing,
                 )

@@ -136,7 +136,10 @@ def _stored_block(file: Path, recording: Recording, pack: Sequence[range]) -> En
             broken = {int(place): reason for place, reason in json.loads(str(arrays["broken"])).items()}
             image_ms = float(arrays["image_ms"])
             return EncodedBlock(
-                *(arrays["places"], arrays["encodings"], arrays["shows_nothing"], broken),
+                arrays["places"],
+                arrays["encodings"],
+                arrays["shows_nothing"],
+                broken,
                 image_ms=None if np.isnan(image_ms) else image_ms,
             )
     except (OSError, ValueError, KeyError, EOFError):

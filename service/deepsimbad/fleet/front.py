@@ -33,8 +33,18 @@ from deepsimbad.store.catalog import ApiKey
 from deepsimbad.store.durable import storage_faults
 
 _PASSED = (  # of a request's scope
-    *("type", "asgi", "http_version", "method", "path", "raw_path", "query_string", "headers"),
-    *("scheme", "client", "server", "root_path"),
+    "type",
+    "asgi",
+    "http_version",
+    "method",
+    "path",
+    "raw_path",
+    "query_string",
+    "headers",
+    "scheme",
+    "client",
+    "server",
+    "root_path",
 )
 
 _PATIENCE_S = 10.0  # longest wait of a request whose owners are both away; one that ended is back in half of it

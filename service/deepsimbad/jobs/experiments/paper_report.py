@@ -207,7 +207,10 @@ def _claims_of_moves(
         judge("Informed needs fewer views than random moves", "views", DEFAULT_PLANNER, RANDOM, "us"),
         judge(
             f"Informed needs fewer views than the best constant move, {display_name(soonest_move)}",
-            *("views", DEFAULT_PLANNER, soonest_move, "us"),
+            "views",
+            DEFAULT_PLANNER,
+            soonest_move,
+            "us",
         ),
     ]
     ends = [f"{CONSTANT}_1", f"{CONSTANT}_10"]

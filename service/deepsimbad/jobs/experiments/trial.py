@@ -144,7 +144,11 @@ def run_trial(
         progress.update((row + 1) / len(true_images))
     scores = {DEFAULT_RELEVANCE.value: scorer.result(), BRUTE_FORCE_U: all_scorer.result()}
     return TrialReport(
-        *(map_build.map, queries, outcomes, np.array(beliefs, np.float32), scores),
+        map_build.map,
+        queries,
+        outcomes,
+        np.array(beliefs, np.float32),
+        scores,
         {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
         n_forgot,
         map_build.warnings,

@@ -174,7 +174,12 @@ def build_maps(
         landmark_source = landmarks if name.traits.compares_unit_vectors or model is None else model
         share = number / len(config.relevances)
         map_builds[name] = build(
-            *(plan, training, landmarks, landmark_source, config.n_landmarks, evaluator),
+            plan,
+            training,
+            landmarks,
+            landmark_source,
+            config.n_landmarks,
+            evaluator,
             lambda build_share, share=share: on_progress(share + build_share / len(config.relevances)),  # type: ignore[misc]
             fitter=fitter,
         )
