@@ -181,6 +181,7 @@ def test_a_file_is_pulled_recorded_and_verified(pull, deepsimbad, files, tmp_pat
     ran = deepsimbad("weights", "pull", "onnx:m.onnx", *IN)
     assert (ran.code, ran.err.count("\n")) == (1, 1)
     assert f"should have {SHA256}" in ran.err, "it is held to what came first"
+    assert "or say --sha256" in ran.err
     assert not (tmp_path / "w" / "m.onnx").exists()
 
 
@@ -273,6 +274,9 @@ def test_without_a_network_it_says_which_file_to_put_where(deepsimbad, tmp_path,
     assert "put it at w/m.onnx and pull again" in ran.err
     (tmp_path / "w" / "m.onnx").write_bytes(CONTENT)
     ran = deepsimbad("weights", "pull", "onnx:m.onnx", *IN)
+    assert (ran.code, ran.err.count("\n")) == (1, 1)
+    assert "invalid_weights: m.onnx is no whole" in ran.err
+    ran = deepsimbad("weights", "pull", "onnx:m.onnx", "--sha256", SHA256[:8], *IN)
     assert (ran.code, ran.err) == (0, f"onnx:m.onnx is at w/m.onnx, sha256 {SHA256}\n")
 
 

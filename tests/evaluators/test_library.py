@@ -16,6 +16,8 @@ from deepsimbad.evaluators.weights.files import file_sha256
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known_weights
 from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
 
+from .references import random_network, write_matlab
+
 
 def test_every_row_can_be_named_in_a_configuration():
     names = [weights.name for weights in KNOWN] + [canonical(weights.extractor) for weights in KNOWN]
@@ -87,13 +89,24 @@ def test_a_lock_is_read_as_it_was_written(tmp_path):
         lock.pinned_file("x.onnx")
 
 
-def test_a_file_that_lies_here_is_recorded_as_it_is(tmp_path):
-    (tmp_path / "mine.onnx").write_bytes(b"abc")
-    record = pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
-    assert (record.n_bytes, record.url) == (3, None)
-    (tmp_path / "mine.onnx").write_bytes(b"abd")
-    with pytest.raises(InvalidWeightsError, match=record.sha256):
-        pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
+def _pull(path, sha256=None):
+    return pull_file(path.parent, f"netvlad:{path.name}", lambda *_: None, sha256=sha256)
+
+
+def test_a_file_that_lies_here_is_recorded_once_it_can_be_loaded(tmp_path):
+    path = tmp_path / "net.mat"
+    write_matlab(path, random_network("matlab"))
+    content = path.read_bytes()
+    path.write_bytes(content[:-1000])
+    with pytest.raises(InvalidWeightsError, match=r"net\.mat"):
+        _pull(path)
+    path.write_bytes(content)
+    record = _pull(path)
+    assert (record.n_bytes, record.url) == (len(content), None)
+    path.write_bytes(b"another")
+    with pytest.raises(InvalidWeightsError, match=f"{record.sha256}: .* or say --sha256"):
+        _pull(path)
+    assert _pull(path, file_sha256(path)).n_bytes == 7, "who states the digest vouches for the file"
 
 
 def test_a_known_file_must_have_the_digest_that_is_known_of_it(tmp_path):

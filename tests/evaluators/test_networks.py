@@ -48,7 +48,11 @@ def write_network(folder, family, **options):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_netvlad_agrees_with_the_equations(tmp_path, family):
     path, network = write_network(tmp_path, family)
-    assert read_netvlad(path).preset.family == family
+    weights = read_netvlad(path)
+    assert weights.preset.family == family
+    # Said apart, since a random network hardly feels another family's mean, or one in BGR.
+    assert weights.tensors["mean"].tolist() == pytest.approx(network.mean)
+    assert weights.tensors["deviation"].tolist() == pytest.approx(network.deviation)
     image = scene(90, 118) if family == "matlab" else scene(480, 640)
     expected = netvlad_encoding(network, image, np.float32)
     for runtime, least_cosine in PRECISIONS:

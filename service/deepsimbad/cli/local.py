@@ -176,6 +176,8 @@ def map_(
     }
     left_out = {}
     refuse_impossible(config, {role: len(recording.frames) for role, recording in recordings.items()}, None)
+    if any(recording.encodings is None for recording in recordings.values()):
+        measure.load()
     with open_given_catalog() as catalog:
         record, _ = catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
         if thumbnails is not None:

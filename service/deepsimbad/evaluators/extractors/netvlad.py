@@ -84,6 +84,7 @@ class NetVladWeights:
     preset: Preset
     tensors: Mapping[str, Tensor]
     file: str
+    origins: Mapping[str, str]  # what the file calls them; empty where it has no names for them
 
     @property
     def encoding_dim(self) -> int:
@@ -92,11 +93,11 @@ class NetVladWeights:
 
     def module(self) -> NetVlad:
         """The network of these weights, of the widths they have; raises InvalidWeightsError."""
-        channels = [len(self.tensors[f"trunk.convolutions.{i}.bias"]) for i in range(N_CONVOLUTIONS)]
+        channels = [len(self.tensors[f"trunk.convolutions.{i}.weight"]) for i in range(N_CONVOLUTIONS)]
         n_whitened = self.encoding_dim if "whitening.bias" in self.tensors else None
         with torch.device("meta"):  # the file's tensors become the parameters: nothing is made to be overwritten
             module = NetVlad(channels, len(self.tensors["centres"]), n_whitened, self.preset.cluster_major)
-        fill(module, self.tensors, self.file)
+        fill(module, self.tensors, self.file, self.origins)
         return module
 
 
@@ -140,7 +141,10 @@ def _renamed(preset: Preset, names: _Names, tensors: Mapping[str, Any], file: st
     for name in ("assignment", "whitening.weight"):  # convolutions of 1 x 1 there, products of matrices here
         if name in checked and checked[name].ndim == 4:
             checked[name] = checked[name].flatten(1)
-    return NetVladWeights(preset, checked | _colours(preset.mean, preset), file)
+    if checked["assignment"].shape != checked["centres"].shape:
+        first, second = (f"{name} of shape {list(tensors[name].shape)}" for name in (names.assignment, names.centres))
+        raise InvalidWeightsError(f"{file} has {first} and {second}, which do not fit together", file=file)
+    return NetVladWeights(preset, checked | _colours(preset.mean, preset), file, origins)
 
 
 def _checked(tensor: Any, name: str, file: str) -> Tensor:
@@ -182,7 +186,7 @@ def _of_matlab(path: Path) -> NetVladWeights:
     whitening, bias = _weights(net, 33, file)
     tensors["whitening.weight"] = _tensor(_shaped(whitening, (n_inputs * n_clusters, bias.size), 33, file).T)
     tensors["whitening.bias"] = _tensor(bias.ravel(order="F"))
-    return NetVladWeights(MATLAB, tensors | _colours(_average_colour(net, file), MATLAB), file)
+    return NetVladWeights(MATLAB, tensors | _colours(_average_colour(net, file), MATLAB), file, {})
 
 
 def _weights(net: Any, layer: int, file: str) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:

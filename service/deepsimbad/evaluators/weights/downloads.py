@@ -8,12 +8,15 @@ import stat
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import httpx2
 
-from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
+from deepsimbad.errors import InvalidWeightsError, MissingPackageError, MissingWeightsError
+from deepsimbad.evaluators.compute import Compute, Device, Runtime
+from deepsimbad.evaluators.registry import make_extractor
 from deepsimbad.evaluators.weights.files import file_sha256
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, Argument, known_weights
 from deepsimbad.evaluators.weights.lock import (
@@ -58,7 +61,8 @@ def pull_file(
 
     Raises:
         MissingWeightsError: It cannot be fetched; the message says where to put it.
-        InvalidWeightsError: It has another digest.
+        InvalidWeightsError: It has another digest, or one that nobody stated cannot be loaded.
+        OutOfMemoryError: There is too little memory to load it.
     """
     name = extractor.partition(":")[2]
     lock, target = Lock.read(folder), folder / name
@@ -66,18 +70,22 @@ def pull_file(
     old_record = lock.files.get(name)
     expected_sha256 = sha256 or (old_record.sha256 if old_record else None) or (weights.sha256 if weights else None)
     source_url = old_record.url if old_record else None
+    advice = ", or say --sha256 with the digest of the right file" if old_record and not sha256 else ""
     if target.is_file():
         digest = found_sha256(target) or ""
-        check_digest(name, digest, expected_sha256, f"remove {target}, and pull it again")
+        check_digest(name, digest, expected_sha256, f"remove {target}, and pull it again{advice}")
+        if expected_sha256 is None:  # nobody vouches for it: what is no whole file would be held to for ever
+            with suppress(MissingPackageError):
+                make_extractor(extractor, Compute(Runtime.TORCH, Device.CPU, weights_dir=folder))
     else:
         source_url = url or source_url or (weights.url if weights else None)
         if source_url is None:
             page = weights.page if weights else None
-            advice = f"get it from {page} and " if page else "say where it is with --url, or "
+            source = f"get it from {page} and " if page else "say where it is with --url, or "
             raise MissingWeightsError(
-                f"{name} is not known to be at any address: {advice}put it at {target}", file=name
+                f"{name} is not known to be at any address: {source}put it at {target}", file=name
             )
-        digest = fetch(source_url, target, tell, expected_sha256)
+        digest = fetch(source_url, target, tell, expected_sha256, advice)
     record = FileRecord(digest, target.stat().st_size, extractor, source_url)
     lock.with_file(name, record).write()
     return record
@@ -159,7 +167,7 @@ def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
     return record
 
 
-def fetch(url: str, target: Path, tell: Tell, sha256: str | None = None) -> str:
+def fetch(url: str, target: Path, tell: Tell, sha256: str | None = None, advice: str = "") -> str:
     """Download a file.
 
     The part received waits in `NAME.part`, and the version of the file it belongs to in `NAME.part.etag`, so that a
@@ -168,6 +176,7 @@ def fetch(url: str, target: Path, tell: Tell, sha256: str | None = None) -> str:
     Args:
         target: Path of the file; one that lies there is replaced.
         sha256: Its digest in hex, or the first digits of it; None: not known.
+        advice: What can be done where it has another, to end the error's message.
 
     Returns:
         Its SHA-256, in hex.
@@ -177,7 +186,7 @@ def fetch(url: str, target: Path, tell: Tell, sha256: str | None = None) -> str:
         InvalidWeightsError: It has another digest, or is larger than any file of weights.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    return _Download(url, target, tell, sha256).run()
+    return _Download(url, target, tell, sha256, advice).run()
 
 
 def resolve_commit(repository: str, advice: str) -> str:
@@ -236,8 +245,9 @@ def check_digest(name: str, sha256: str, expected: str | None, remedy: str) -> N
 class _Download:
     """The download of one file."""
 
-    def __init__(self, url: str, target: Path, tell: Tell, sha256: str | None) -> None:
+    def __init__(self, url: str, target: Path, tell: Tell, sha256: str | None, advice: str) -> None:
         self._url, self._to, self._tell, self._sha256 = url, target, tell, sha256
+        self._digest_advice = advice
         self._advice = f"fetch it where there is a network, put it at {target} and pull again"
         self._part = target.with_name(f"{target.name}.part")
         self._version = target.with_name(f"{target.name}.part.etag")
@@ -328,7 +338,7 @@ class _Download:
         sha256 = file_sha256(self._part)
         if not matches(sha256, self._sha256):
             self._forget()
-        check_digest(self._to.name, sha256, self._sha256, f"what {self._url} sent was not kept")
+        check_digest(self._to.name, sha256, self._sha256, f"what {self._url} sent was not kept{self._digest_advice}")
         self._part.replace(self._to)
         self._version.unlink(missing_ok=True)
         return sha256

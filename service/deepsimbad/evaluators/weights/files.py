@@ -82,13 +82,14 @@ def load_checkpoint(path: Path) -> Any:
         ) from error
 
 
-def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str) -> None:
+def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str, origins: Mapping[str, str] | None = None) -> None:
     """Fill a module's parameters and buffers by name.
 
     Args:
         module: The module, changed in place.
         tensors: By the module's names; further ones are passed over.
         file: Where they come from, for the error.
+        origins: What the file calls them, by the module's names, for the error too; None: by these.
 
     Raises:
         InvalidWeightsError: One is missing, of another shape or not finite.
@@ -99,19 +100,21 @@ def fill(module: "nn.Module", tensors: Mapping[str, Any], file: str) -> None:
         raise InvalidWeightsError(f"{file} holds no weights by name", file=file)
     parameters = module.state_dict()
     for name, parameter in parameters.items():
-        tensor = tensors.get(name)
+        tensor, origin = tensors.get(name), (origins or {}).get(name, name)
         if (
             not isinstance(tensor, torch.Tensor)
             or tensor.layout is not torch.strided
             or tensor.is_floating_point() != parameter.is_floating_point()
         ):
-            raise InvalidWeightsError(f"{file} has no {name}: it is of another network", file=file, missing=name)
+            raise InvalidWeightsError(f"{file} has no {origin}: it is of another network", file=file, missing=origin)
         if tensor.shape != parameter.shape:
             raise InvalidWeightsError(
-                f"{file} has {name} of shape {list(tensor.shape)}, not {list(parameter.shape)}", file=file, name=name
+                f"{file} has {origin} of shape {list(tensor.shape)}, not {list(parameter.shape)}",
+                file=file,
+                name=origin,
             )
         if not torch.isfinite(tensor).all():
-            raise InvalidWeightsError(f"{file} has NaN or infinity in {name}", file=file, name=name)
+            raise InvalidWeightsError(f"{file} has NaN or infinity in {origin}", file=file, name=origin)
     # Assigned, not copied: a whitening is half a gigabyte, and the module may have been made without any memory.
     module.load_state_dict(
         {name: tensors[name].to(parameter.dtype) for name, parameter in parameters.items()}, assign=True
@@ -137,10 +140,8 @@ def check_size(path: Path) -> None:
                 unpacked = sum(member.file_size for member in archive.infolist())
         except (zipfile.BadZipFile, OSError, ValueError) as error:
             raise InvalidWeightsError(f"{path.name} is no whole file of weights", file=path.name) from error
-    if unpacked > _MOST_BYTES or unpacked > _MOST_RATIO * max(packed, 1):
-        raise InvalidWeightsError(
-            f"{path.name} unpacks to {unpacked} bytes, more than any file of weights", file=path.name
-        )
+    if unpacked > min(_MOST_BYTES, _MOST_RATIO * max(packed, 1)):
+        _refuse_unpacked(path.name)
 
 
 def read_variable(path: Path, name: str) -> Any:
@@ -193,13 +194,21 @@ def _body(stream: BinaryIO, kind: int, n_bytes: int, limit_bytes: int, file: str
         except (zlib.error, MemoryError) as error:
             raise InvalidWeightsError(f"{file} is damaged, or does not fit the memory", file=file) from error
         if len(body) > limit_bytes or (unpack is not None and unpack.unconsumed_tail):
-            raise InvalidWeightsError(f"{file} unpacks to more than any file of weights", file=file)
+            _refuse_unpacked(file)
     if unpack is None:
         return body
     if not unpack.eof or len(body) < 8 or struct.unpack_from("<I", body) != (_MATRIX,):
         _refuse(file)
     del body[:8]
     return body
+
+
+def _refuse_unpacked(file: str) -> NoReturn:
+    raise InvalidWeightsError(
+        f"{file} unpacks to more than {_MOST_RATIO} times its size, or than {_MOST_BYTES >> 30} GiB, "
+        "which no file of weights does",
+        file=file,
+    )
 
 
 def _refuse(file: str) -> NoReturn:
