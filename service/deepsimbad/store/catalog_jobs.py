@@ -156,6 +156,15 @@ def _update(db: Database, job_id: str, fields: dict[str, Any]) -> JobRecord:
 def _job(row: tuple[Any, ...]) -> JobRecord:
     job_id, domain, kind, config, state, stage, progress, eta_s, result, error, *rest, _ = row
     return JobRecord(
-        *(job_id, domain, kind, from_json(config), JobState(state), stage, progress, eta_s),
-        *(from_json(result), from_json(error), *rest),
+        job_id,
+        domain,
+        kind,
+        from_json(config),
+        JobState(state),
+        stage,
+        progress,
+        eta_s,
+        from_json(result),
+        from_json(error),
+        *rest,
     )

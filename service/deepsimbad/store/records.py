@@ -86,8 +86,13 @@ def read_domains(db: Database, name: str | None = None, last_name: str = "", lim
     rows = db.execute(f"{_SELECT_DOMAIN} WHERE domain.name {condition} ORDER BY domain.name LIMIT ?", [bound, limit])
     return [
         DomainRecord(
-            *(name, from_json(evaluator), bool(closed), tuple(from_json(actions_m))),
-            *(version, created_at, from_json(options)),
+            name,
+            from_json(evaluator),
+            bool(closed),
+            tuple(from_json(actions_m)),
+            version,
+            created_at,
+            from_json(options),
         )
         for name, evaluator, closed, actions_m, version, created_at, options in rows
     ]

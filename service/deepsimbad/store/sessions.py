@@ -369,8 +369,14 @@ def _true_positions(db: Database, number: int) -> NDArray[np.float64] | None:
 def session_columns(record: SessionRecord) -> tuple[Any, ...]:
     """A new session, from its id on, as the file has it."""
     return (
-        *(record.session_id, record.domain, record.map_version, record.map_sha256),
-        *(to_json(record.config), record.created_at, record.expires_at, record.key_id),
+        record.session_id,
+        record.domain,
+        record.map_version,
+        record.map_sha256,
+        to_json(record.config),
+        record.created_at,
+        record.expires_at,
+        record.key_id,
     )
 
 
@@ -382,12 +388,17 @@ def columns_of(row: JournalRow, written_at: float) -> tuple[Any, ...]:
     ranks = np.rint(2.0 * row.ranks.astype(np.float64)).astype("<u2" if row.ranks.size <= _MOST_IN_TWO_BYTES else "<u4")
     dissimilarities, encoding = row.dissimilarities, row.encoding
     return (
-        *("observation", written_at, row.expires_at),
+        "observation",
+        written_at,
+        row.expires_at,
         *((row.idempotency.key, row.idempotency.digest) if row.idempotency else (None, None)),
-        *(row.action_m, row.action_std_m, ranks.tobytes()),
+        row.action_m,
+        row.action_std_m,
+        ranks.tobytes(),
         None if dissimilarities is None else np.ascontiguousarray(dissimilarities, "<f4").tobytes(),
         None if encoding is None else np.ascontiguousarray(encoding, "<f4").tobytes(),
-        *(None, None),
+        None,
+        None,
     )
 
 
@@ -417,7 +428,10 @@ def _row(row: tuple[Any, ...]) -> JournalRow:
     doubled_ranks = np.frombuffer(ranks, "<u2" if len(ranks) // 2 <= _MOST_IN_TWO_BYTES else "<u4")
     dissimilarities, encoding = (None if view is None else np.frombuffer(view, "<f4") for view in views)
     return ObservedRow(
-        *(sequence, expires_at, action_m, action_std_m),
+        sequence,
+        expires_at,
+        action_m,
+        action_std_m,
         np.asarray(doubled_ranks / 2, np.float32),
         dissimilarities,
         encoding,
