@@ -77,6 +77,14 @@ def test_the_weight_is_learnt_where_the_other_drive_saw_the_same_places(worse):
     assert FUSED.fit(lesson).model["fused_weight"] == 0.5
 
 
+def test_a_half_that_tells_no_frame_from_another_is_no_better_than_chance():
+    first, second = (with_one_half(season(number, 1.0, 1.0), 1).encodings for number in (1, 2))
+    fitted = FUSED.fit(Lesson(first, np.arange(N), other=second, places=np.tile(np.arange(N), (2, 1)).T))
+    assert fitted.metrics["anr"]["1.0"] == pytest.approx(100 * 0.5 * (N - 1) / N)
+    assert fitted.metrics["anr"]["0.0"] < 20
+    assert fitted.metrics["weight"] < 1
+
+
 def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better():
     noise = (2.0, 2.0)
     landmarks, training, test = (season(number, *noise) for number in (1, 2, 3))

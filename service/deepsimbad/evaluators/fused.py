@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.composed import is_composed
+from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Evaluator, Fitted, Fitting, Image, LandmarkModel, Lesson
 from deepsimbad.evaluators.feature_l2 import FeatureL2, checked_encodings
@@ -132,7 +133,7 @@ class Fused(FeatureL2):
 
 def _anr(dissimilarities: NDArray[np.float32], true_frames: NDArray[np.int64]) -> float:
     """ANR in percent of queries by dissimilarities [n, m] to frames; `true_frames` [n] and neighbours are right."""
-    frames = np.arange(dissimilarities.shape[1])
-    near = np.abs(frames - true_frames[:, np.newaxis]) <= _NEAR_FRAMES
-    best = np.where(near, dissimilarities, np.inf).min(axis=1, keepdims=True)
-    return float(100 * ((dissimilarities < best) & ~near).sum(axis=1).mean() / dissimilarities.shape[1])
+    scorer, frames = RetrievalScorer(), np.arange(dissimilarities.shape[1])
+    for row, true_frame in zip(dissimilarities, true_frames.tolist(), strict=True):
+        scorer.add(-row, np.flatnonzero(np.abs(frames - true_frame) <= _NEAR_FRAMES))
+    return scorer.result().anr

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad.core.composed import Moments, described, is_composed, principal_directions
-from deepsimbad.core.metrics import mean_interval
+from deepsimbad.core.metrics import mean_interval, rank_of_truth
 from deepsimbad.errors import InvalidEncodingError, TooFewToFitError
 from deepsimbad.evaluators.base import Fitting, LandmarkModel, Lesson
 from deepsimbad.evaluators.compute import Compute
@@ -110,11 +110,9 @@ class PairScores:
         if not is_scored.any():
             return cls(float("nan"), float("nan"), np.empty(0))
         near, d = near[is_scored], measure(units.queries[rows[is_scored]])
-        best = np.where(near, d, np.inf).min(axis=1, keepdims=True)
-        n_before = ((d < best) & ~near).sum(axis=1) + 0.5 * ((d == best) & ~near).sum(axis=1)
         far_d = np.sort(d[~near])
         n_smaller = np.searchsorted(far_d, d[near], "left") + np.searchsorted(far_d, d[near], "right")
-        ranks = 100 * n_before / (~near).sum(axis=1)
+        ranks = 100 * np.array([_share_before(*row) for row in zip(d, near, strict=True)])
         return cls(float(ranks.mean()), 1 - float(n_smaller.mean()) / (2 * far_d.size), ranks)
 
     def as_dict(self) -> dict[str, Any]:
@@ -124,6 +122,13 @@ class PairScores:
             **{name: value if np.isfinite(value) else None for name, value in figures.items()},
             "n_queries": self.ranks.size,
         }
+
+
+def _share_before(dissimilarities: NDArray[np.float32], near: NDArray[np.bool_]) -> float:
+    """Share of landmarks of other places ranked before the best-placed one of the query's, which are `near` [r]."""
+    other_values = dissimilarities[~near]
+    relevance = -np.append(other_values, dissimilarities[near].min())
+    return rank_of_truth(relevance, np.array([other_values.size])) / other_values.size
 
 
 @dataclass(frozen=True)
