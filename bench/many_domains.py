@@ -12,6 +12,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +29,7 @@ from deepsimbad.core.composed import unit
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance, shows_nothing
+from deepsimbad.evaluators.compute import available_cores
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import encode_recording
 from deepsimbad.store.catalog import Catalog
@@ -192,7 +194,7 @@ def speed_lines() -> Iterator[str]:
             made_maps.append(replace(base, lists=lists, landmark_model=model, usual_encoding=usual_encoding))
         return made_maps
 
-    rows = []
+    rows, pool = [], ThreadPoolExecutor(available_cores())
     for name, n, d, is_shared in (
         ("landmarks of their own, encodings of 96 numbers", N_DOMAINS, None, False),
         ("one landmark model", N_DOMAINS, None, True),
@@ -203,7 +205,7 @@ def speed_lines() -> Iterator[str]:
 
         def ask(atlas: Atlas = atlas, names: Sequence[str] = names, d: int = d or 96) -> None:
             view = rng.normal(size=d).astype(np.float32)
-            posterior(dict(zip(names, atlas.log_evidences(view).tolist(), strict=True)))
+            posterior(dict(zip(names, atlas.log_evidences(view, pool).tolist(), strict=True)))
 
         timing = timed(ask, 60, 5)
         rows.append((name, n, str(timing), duration(timing.median_s / n)))

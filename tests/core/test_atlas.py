@@ -1,10 +1,12 @@
 """Which of many maps a view is of: all at once as one by one."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from deepsimbad.core import atlas as atlas_module
 from deepsimbad.core.atlas import Atlas, _find, _shelf, log_evidence, posterior
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
@@ -25,7 +27,7 @@ def query_of(map_, encoding):
 
 
 @pytest.mark.parametrize("d", [24, 150])  # the longer ones are projected
-def test_many_maps_at_once_say_what_each_says(d):
+def test_many_maps_at_once_say_what_each_says(d, monkeypatch):
     first = composed_map(0, 40, d, 20)
     maps = [first, composed_map(1, 70, d, 30), composed_map(0, 40, d, 20), composed_map(2, 5000, d, 25)]
     maps += [replace(first, lists=np.ascontiguousarray(first.lists[:, ::-1]))]  # of the same landmarks
@@ -44,6 +46,9 @@ def test_many_maps_at_once_say_what_each_says(d):
     encoding[: d // 3] = np.nan  # not told
     expected = [log_evidence(map_, query_of(map_, encoding)) for map_ in maps]
     assert atlas.log_evidences(encoding) == pytest.approx(expected, abs=1e-4)
+    monkeypatch.setattr(atlas_module, "_AT_ONCE", 10)
+    with ThreadPoolExecutor(2) as pool:
+        assert atlas.log_evidences(encoding, pool).tolist() == atlas.log_evidences(encoding).tolist()
 
 
 def test_the_evidence_of_one_map_slowly():

@@ -13,14 +13,12 @@ Every domain is as probable as every other before the view, because the question
 which of their metres or images; `elsewhere`, none of them, is then as probable as a robot is to be lost.
 """
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
 from numba import njit, typed
-from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief.cells import SUMS
@@ -101,8 +99,8 @@ class Atlas:
         self._n_landmarks = max(len(space[3]) for space in distinct_spaces)
         self._n_spaces = len(distinct_spaces)
 
-    def log_evidences(self, encoding: NDArray[np.float32]) -> NDArray[np.float64]:
-        """[m] log evidence of every map for one encoding [d]."""
+    def log_evidences(self, encoding: NDArray[np.float32], pool: Executor | None = None) -> NDArray[np.float64]:
+        """[m] log evidence of every map for one encoding [d]; by the pool's threads where there are many maps."""
         n = len(self.maps)
         products = np.empty((self._n_spaces, self._n_landmarks), np.float32)
         far_shares, best_relevances = np.empty(self._n_spaces), np.empty(n)
@@ -116,8 +114,8 @@ class Atlas:
         def find(start: int, stop: int) -> None:
             _find(self._lists, self._lengths, weights, self._space_of, products, start, stop, best_relevances)
 
-        _in_blocks(self._n_spaces, compare)
-        _in_blocks(n, find)
+        _in_blocks(self._n_spaces, compare, pool)
+        _in_blocks(n, find, pool)
         return _weighed(best_relevances, self._scales, far_shares[self._space_of], np.full(n, encoding.size))
 
 
@@ -146,9 +144,9 @@ def _space(map_: Map) -> tuple[NDArray[Any], ...]:
     return statistics.encodings.mean, statistics.encodings.std, np.asarray(projection, np.float32), prototypes
 
 
-def _shelf(arrays: Sequence[NDArray[Any]]) -> Any:
+def _shelf(arrays: Sequence[NDArray[Any]]) -> Sequence[NDArray[Any]]:
     """Arrays of one type as a list for compiled code."""
-    shelf = typed.List()
+    shelf: list[NDArray[Any]] = typed.List()
     for array in arrays:
         view = np.ascontiguousarray(array).view()
         view.setflags(write=False)
@@ -156,24 +154,35 @@ def _shelf(arrays: Sequence[NDArray[Any]]) -> Any:
     return shelf
 
 
-def _in_blocks(n: int, run: Any) -> None:
-    """Call `run(start, stop)` for blocks of 0..n, in as many threads as there are cores."""
-    blocks = [(start, min(start + _AT_ONCE, n)) for start in range(0, n, _AT_ONCE)]
-    if len(blocks) == 1:
+def _in_blocks(n: int, run: Callable[[int, int], None], pool: Executor | None) -> None:
+    """Call `run(start, stop)` for 0..n, in blocks by the threads of a pool."""
+    if pool is None or n <= _AT_ONCE:
         run(0, n)
-    else:
-        for _ in _threads().map(lambda block: run(*block), blocks):
-            pass
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(NUMBA_NUM_THREADS, thread_name_prefix="atlas")
+        return
+    starts = range(0, n, _AT_ONCE)
+    for _ in pool.map(run, starts, (min(start + _AT_ONCE, n) for start in starts)):
+        pass
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _compare(encoding, spaces, first, stop, deviations, products, far_shares):  # type: ignore[no-untyped-def]
-    """Write an encoding's products [g, r] with landmarks and its strangeness [g], in spaces first..stop."""
+def _compare(
+    encoding: NDArray[np.float32],
+    spaces: Sequence[Sequence[NDArray[Any]]],
+    first: int,
+    stop: int,
+    deviations: NDArray[np.float32],
+    products: NDArray[np.float32],
+    far_shares: NDArray[np.float64],
+) -> None:
+    """Write an encoding's products [g, r] with landmarks and its strangeness [g], in spaces first..stop.
+
+    The rules are those of `retrieval.products_with_landmarks` and `relevance.strangeness`, for many spaces at once.
+
+    Args:
+        encoding: [d].
+        spaces: Means and stds [d], projections [d, k] or [0, 0] and landmarks [r, k] of every space.
+        deviations: [g, d] room for an encoding in standard deviations.
+    """
     means, stds, projections, prototypes = spaces
     for g in range(first, stop):
         mean, std, projection, landmarks, z = means[g], stds[g], projections[g], prototypes[g], deviations[g]
@@ -213,8 +222,24 @@ def _compare(encoding, spaces, first, stop, deviations, products, far_shares):  
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS | {"nnan", "nsz"})
-def _find(all_lists, all_lengths, weights, space_of, products, first, stop, best_relevances):  # type: ignore[no-untyped-def]
-    """Write the greatest relevance [m] of maps first..stop, four list positions at a time, the last with the rest."""
+def _find(
+    all_lists: Sequence[NDArray[np.uint16]],
+    all_lengths: Sequence[NDArray[np.float32]],
+    weights: NDArray[np.float32],
+    space_of: NDArray[np.int64],
+    products: NDArray[np.float32],
+    first: int,
+    stop: int,
+    best_relevances: NDArray[np.float64],
+) -> None:
+    """Write the greatest relevance [m] of maps first..stop, four list positions at a time, the last with the rest.
+
+    The relevance is `retrieval.relevances` of `composed` maps, of lists [h, n] and lengths [n] of any sizes.
+
+    Args:
+        weights: [h] of list positions, of the longest lists.
+        space_of: [m] the row of `products` [g, r] that is a map's.
+    """
     n_places = -(-weights.size // 4) * 4
     tables = np.empty((n_places, products.shape[1]), np.float32)
     buffer = np.zeros(_BLOCK, np.float32)

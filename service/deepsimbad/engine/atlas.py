@@ -7,11 +7,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from operator import is_not
 from typing import Any, Protocol, Self
 
 import numpy as np
+from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 
 from deepsimbad.core import atlas
 from deepsimbad.core.frames import Camera
@@ -109,6 +111,7 @@ class Atlas:
         self._clock = clock
         self._lock = threading.Lock()
         self._last_atlas: atlas.Atlas | None = None  # of the maps that were asked last
+        self._pool = ThreadPoolExecutor(NUMBA_NUM_THREADS, thread_name_prefix="atlas")  # begins threads at first need
 
     def gather(self, names: Sequence[str], is_all: bool) -> tuple[list[MappedDomain], dict[str, DeepSimbadError]]:
         """The domains and their active maps, and why others have none; reads files for some seconds at most.
@@ -177,7 +180,8 @@ class Atlas:
             )
             (batch if is_batched else singles).append(mapped_domain)
         if batch and encoding is not None:
-            values = self._atlas_of([mapped_domain.snapshot for mapped_domain in batch]).log_evidences(encoding)
+            batch_atlas = self._atlas_of([mapped_domain.snapshot for mapped_domain in batch])
+            values = batch_atlas.log_evidences(encoding, self._pool)
             for mapped_domain, value in zip(batch, values.tolist(), strict=True):
                 log_evidences[mapped_domain.record.name] = value
         for mapped_domain in singles:
