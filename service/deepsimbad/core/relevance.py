@@ -84,6 +84,11 @@ class UpdateRule(StrEnum):
     LOG_LIKELIHOOD = "log_likelihood"
     MIXTURE = "mixture"
 
+    @property
+    def is_additive(self) -> bool:
+        """Whether evidence is added to weights, as in the paper, rather than multiplies them as a likelihood."""
+        return self in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
+
 
 @dataclass(frozen=True)
 class RelevanceTraits:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepsimbad.core.belief.cells import Cells
-from deepsimbad.core.belief.evidence import ViewEvidence
+from deepsimbad.core.belief.evidence import ViewEvidence, batch_evidence
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.motion import motion_std_m
 from deepsimbad.core.belief.particles import FilterKind, ParticleFilter
@@ -46,6 +46,15 @@ def test_a_view_that_answers_every_place_alike_changes_nothing(kind, rule, route
     belief = start.updated(evidence_of(np.full(100, 0.7), rule), step=0)
     np.testing.assert_allclose(belief.mass, start.mass, atol=1e-3)
     assert belief.off_route == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("rule", list(UpdateRule))
+def test_evidence_of_a_batch_is_that_of_each_of_its_views(rule):
+    relevance = np.random.default_rng(0).normal(size=(3, 40)).astype(np.float32).round(1)  # some are tied
+    for row, batch_row in zip(relevance, batch_evidence(relevance, rule, 2.5), strict=True):
+        values = evidence_of(row, rule, 2.5).values
+        expected = values if rule in ADDITIVE else np.exp(values - values.max())
+        np.testing.assert_allclose(batch_row, expected, rtol=1e-5)
 
 
 def test_reciprocal_rank_shares_the_ranks_of_ties():

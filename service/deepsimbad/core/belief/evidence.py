@@ -47,10 +47,8 @@ class ViewEvidence:
     @classmethod
     def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared_error: float = 0.0) -> Self:
         """From a view's relevance [n], which times `scale` is a log-likelihood."""
-        if rule is UpdateRule.ADDITIVE_RELEVANCE:
-            return cls(rule, np.maximum(relevance, 0).astype(np.float64))
-        if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
-            return cls(rule, 1.0 / mean_ranks(relevance))
+        if rule.is_additive:
+            return cls(rule, _addends(relevance, rule).astype(np.float64))
         return cls(rule, _centred(relevance, scale), shared_error if rule is UpdateRule.MIXTURE else 0.0)
 
     def likelihood(
@@ -70,10 +68,22 @@ class ViewEvidence:
         exponent, size = _news(values, *((values, 0.0) if last is None else (last, self.shared_error)), trust)
         return np.exp(exponent, out=exponent), 0.5 * trust * size
 
-    @property
-    def is_added(self) -> bool:
-        """Whether its values are added to weights, as in the paper, rather than multiply them as likelihoods."""
-        return self.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK}
+
+def batch_evidence(relevance: NDArray[np.float32], rule: UpdateRule, scale: float) -> NDArray[np.float32]:
+    """[e, n] float32: what views of this relevance [e, n] add to weights of mean 1, or multiply them by.
+
+    It is what `ViewEvidence` says of each, believed once and in single precision, with no view before.
+    """
+    if rule.is_additive:
+        return np.asarray(_addends(relevance, rule), np.float32)
+    return np.asarray(np.exp(np.float32(scale) * (relevance - relevance.max(axis=1, keepdims=True))), np.float32)
+
+
+def _addends(relevance: NDArray[np.float32], rule: UpdateRule) -> NDArray[np.floating]:
+    """What an additive rule adds, for relevances [n] or [e, n]: what is above 0 of them, or their reciprocal ranks."""
+    if rule is UpdateRule.ADDITIVE_RELEVANCE:
+        return np.maximum(relevance, 0)
+    return np.asarray(1.0 / np.apply_along_axis(mean_ranks, -1, relevance))
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)

@@ -138,7 +138,7 @@ class GridFilter:
     def updated(self, evidence: ViewEvidence, step: int) -> "GridFilter":  # noqa: ARG002
         """The belief after a view; `step` as of `predicted`."""
         values = self._at_cells(evidence.values)
-        if evidence.is_added:
+        if evidence.rule.is_additive:
             mass, doubt = add_evidence(self._believed, values), self.doubt
             masses, mass_moved = np.outer(1 - doubt.lost, mass), 0.5 * float(np.abs(mass - self._believed).sum())
         else:

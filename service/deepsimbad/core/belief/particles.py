@@ -145,7 +145,7 @@ class ParticleFilter:
     def updated(self, evidence: ViewEvidence, step: int) -> Self:
         """See `GridFilter.updated`; the paper's particles are resampled at once where their weights are uneven."""
         least_moved = 0.0
-        if evidence.is_added:
+        if evidence.rule.is_additive:
             images, on_route = self.route.nearest_image(self.position_m), 1 - self.doubt.lost
             weights = np.outer(on_route, add_evidence(self._mean_weights / on_route.mean(), evidence.values[images]))
             belief = replace(self, weights=weights, found_mass=np.zeros_like(self.found_mass))

@@ -246,6 +246,7 @@ def _see(
 
 @njit(cache=True, nogil=True)
 def _rank(belief: NDArray[np.float32], images_in_cell: NDArray[np.int32], true_cell: int) -> float:
+    """`metrics.rank_of_truth` of the map images in cells, of one true image; -1 where its cell is below 0."""
     if true_cell < 0:
         return -1.0
     truth = belief[true_cell]

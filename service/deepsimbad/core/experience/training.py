@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.belief.evidence import batch_evidence
 from deepsimbad.core.belief.motion import motion_std_m
 from deepsimbad.core.experience.lattice import NO_MOVE, Lattice, Moves, moves_along, step_beliefs, uniform_beliefs
 from deepsimbad.core.experience.nnql import NnqlConfig, Transitions, initial_q_values, learn, q_of_nearest
 from deepsimbad.core.index.retrieval import relevances, shortlist
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule, mean_ranks
+from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule
 from deepsimbad.core.route import Route
 
 EPISODES_A_POINT = 100  # a point of the learning curve
@@ -81,16 +82,8 @@ class TrainingWorld:
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Evidence [e, n] and the nearest map images [e, k], best first, of frames [e] by statistics [e, r]."""
         relevance = relevances(self.map, self.views.at(frames), live)
-        return _evidence(relevance, self.rule, self.map.log_likelihood_scale), shortlist(relevance, self.n_neighbours)
-
-
-def _evidence(relevance: NDArray[np.float32], rule: UpdateRule, scale: float) -> NDArray[np.float32]:
-    """[e, n] float32: what views of this relevance [e, n] add to weights of mean 1, or multiply them by."""
-    if rule is UpdateRule.ADDITIVE_RELEVANCE:
-        return np.maximum(relevance, 0)
-    if rule is UpdateRule.ADDITIVE_RECIPROCAL_RANK:
-        return np.stack([1.0 / mean_ranks(row) for row in relevance]).astype(np.float32)
-    return np.asarray(np.exp(np.float32(scale) * (relevance - relevance.max(axis=1, keepdims=True))), np.float32)
+        evidence = batch_evidence(relevance, self.rule, self.map.log_likelihood_scale)
+        return evidence, shortlist(relevance, self.n_neighbours)
 
 
 def _next_frames(route: Route, actions_m: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -162,7 +155,7 @@ class Walk:
             moves,
             evidence,
             world.true_image[frames],
-            additive=world.rule in {UpdateRule.ADDITIVE_RELEVANCE, UpdateRule.ADDITIVE_RECIPROCAL_RANK},
+            additive=world.rule.is_additive,
         )
 
 
