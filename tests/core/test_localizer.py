@@ -117,6 +117,22 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
     assert state.n_observations == 7
 
 
+def test_a_robot_that_was_believed_elsewhere_begins_anew_with_its_statistics(snapshots, queries):
+    map_ = snapshots()
+    localizer = ActiveLocalizer(map_, LocalizerConfig(update=UpdateRule.LOG_LIKELIHOOD))
+    state = walk(localizer, queries, range(20, 30))
+    step, has_restarted = localizer.observe_or_restart(state, queries[31], 2.0)
+    assert not has_restarted
+    np.testing.assert_array_equal(step.state.belief.mass, localizer.step(state, queries[31], 2.0).state.belief.mass)
+    step, has_restarted = localizer.observe_or_restart(state, queries[70], 900.0)
+    assert has_restarted
+    np.testing.assert_array_equal(step.relevance, relevances(map_, queries[70], state.live.observing(queries[70])))
+    even = GridFilter.uniform(map_.route, UpdateRule.LOG_LIKELIHOOD)
+    evidence = ViewEvidence.of(step.relevance, UpdateRule.LOG_LIKELIHOOD, map_.log_likelihood_scale)
+    np.testing.assert_array_equal(step.state.belief.mass, even.updated(evidence, 0).mass)
+    assert step.plan is None
+
+
 def test_views_of_one_place_share_their_errors_and_those_far_apart_do_not(snapshots):
     map_ = snapshots()
     assert map_.shared_error_after(0.0) == 1

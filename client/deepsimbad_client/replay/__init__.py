@@ -123,8 +123,9 @@ class Scene:
         """Send a session a move and the view after it; returns the outcome, or why the service cannot use the view.
 
         Viewers are shown the outcome. A belief that is wrong may leave no room for the move that was really made, and a
-        recording may jump or go backwards; the robot then starts anew from knowing nothing. `options` are those of
-        `Session.observe`.
+        recording may jump or go backwards; the robot then starts anew from knowing nothing. A prior needs a position,
+        so that this is a normal belief a hundred routes wide, where `ActiveLocalizer.observe_or_restart` has an even
+        one; and the view after it counts as one of a robot that stands. `options` are those of `Session.observe`.
         """
         start_s, forgot = time.perf_counter(), False
         try:

@@ -18,9 +18,9 @@ from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.planners import DEFAULT_PLANNER, Plan, PlanningView, parse_planner
 from deepsimbad.core.relevance import LiveStatistics, Query, UpdateRule
+from deepsimbad.errors import PastTheEndError
 
 _LEAST_MASS_MOVED = 0.01  # share of the belief; a view that moves less of it elsewhere tells nothing
-_STAGES = ("retrieve", "predict", "update", "plan")
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,11 @@ class Step:
     """The outcome of one observation."""
 
     state: LocalizerState  # after the observation
-    plan: Plan | None  # the recommended next move; None where the planner has nothing to go by
+    relevance: NDArray[np.float32]  # [n] of the view
+    shows_place: bool  # whether the view shows anything of the route; another leaves the belief as it was
     is_informative: bool  # whether the view changed the belief, or would have changed one that was less sure
     timings_ms: dict[str, float]  # milliseconds by stage
+    plan: Plan | None = None  # the recommended next move; None where nobody planned, or had nothing to go by
 
 
 class ActiveLocalizer:
@@ -76,7 +78,17 @@ class ActiveLocalizer:
     def step(
         self, state: LocalizerState, query: Query, action_m: float = 0.0, action_std_m: float | None = None
     ) -> Step:
-        """One observation: the move that led to it, then the view.
+        """`observe`, and the plan of the next move."""
+        observed = self.observe(state, query, action_m, action_std_m)
+        start_s = self._clock()
+        plan = self.plan(observed.state)
+        timings_ms = {**observed.timings_ms, "plan": 1000 * (self._clock() - start_s)}
+        return replace(observed, plan=plan, timings_ms=timings_ms)
+
+    def observe(
+        self, state: LocalizerState, query: Query, action_m: float = 0.0, action_std_m: float | None = None
+    ) -> Step:
+        """One observation, without a plan: the move that led to it, then the view.
 
         Args:
             action_m: Metres moved since the last view; ignored for the first. Where the domain's actions only go
@@ -101,18 +113,34 @@ class ActiveLocalizer:
         times_s.append(self._clock())
 
         mass_moved = 0.0
-        if query.is_informative and not is_strange:
+        shows_place = query.is_informative and not is_strange
+        if shows_place:
             shared_error = map_.shared_error_after(moved_m) if step > 0 else 0.0
             evidence = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared_error)
             belief = belief.updated(evidence, step)
             mass_moved = belief.mass_moved
         times_s.append(self._clock())
 
+        timings_ms = dict(zip(("retrieve", "predict", "update"), (1000 * np.diff(times_s)).tolist(), strict=True))
         new_state = LocalizerState(belief, live, relevance, step + 1)
-        plan = self.plan(new_state)
-        times_s.append(self._clock())
-        timings_ms = dict(zip(_STAGES, (1000 * np.diff(times_s)).tolist(), strict=True))
-        return Step(new_state, plan, mass_moved > _LEAST_MASS_MOVED, timings_ms)
+        return Step(new_state, relevance, shows_place, mass_moved > _LEAST_MASS_MOVED, timings_ms)
+
+    def observe_or_restart(
+        self, state: LocalizerState, query: Query, action_m: float, action_std_m: float | None = None
+    ) -> tuple[Step, bool]:
+        """`observe`; a robot whose move leads past the end was believed elsewhere, and this is its first view anew.
+
+        Returns:
+            The step, and whether the robot began anew.
+        """
+        try:
+            return self.observe(state, query, action_m, action_std_m), False
+        except PastTheEndError:
+            return self.observe(self.restart(state), query), True
+
+    def restart(self, state: LocalizerState) -> LocalizerState:
+        """A robot that may be anywhere: the state before any view, but with the statistics of this one."""
+        return replace(self.start(), live=state.live)
 
     def plan(self, state: LocalizerState) -> Plan | None:
         """The move to the next best view from this state."""

@@ -1,20 +1,19 @@
 """Where a single view places the robot: describe, retrieve, believe (II-C)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from time import perf_counter
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief.evidence import ViewEvidence
-from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.summary import BeliefSummary, summarise
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.composed import is_composed
 from deepsimbad.core.descriptor import rank_landmarks, ranks_from_ranked_landmarks
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.index.retrieval import relevances, shortlist
-from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
+from deepsimbad.core.index.retrieval import shortlist
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.on_board import unpack_ranked_landmarks, unpack_unit_encoding
 from deepsimbad.core.planners import Plan
@@ -113,7 +112,7 @@ class Localization:
 def localize(
     snapshot: Map, evaluator: Evaluator, view: View, n_shortlist: int | None = None, watch: Stopwatch | None = None
 ) -> Localization:
-    """Localize one view on its own.
+    """Localize one view on its own: as a session's first, but by the map's statistics alone.
 
     Args:
         n_shortlist: Length of the shortlist and of the belief's top, 1..n; None: 10, or n where that is less.
@@ -126,22 +125,19 @@ def localize(
     length = shortlist_length(snapshot, n_shortlist)
     query = describe(snapshot, evaluator, view)
     watch.lap("describe")
-    relevance = relevances(snapshot, query)
-    watch.lap("retrieve")
-    ids = shortlist(relevance, length)
+    localizer = ActiveLocalizer(snapshot, LocalizerConfig(), perf_counter)
+    step = localizer.observe(replace(localizer.start(), live=None), query)
+    watch.lap("belief", {"retrieve": step.timings_ms["retrieve"]})
+    ids = shortlist(step.relevance, length)
     watch.lap("shortlist")
-    rule = snapshot.update_rule
-    evidence = ViewEvidence.of(relevance, rule, snapshot.log_likelihood_scale)
-    belief = GridFilter.uniform(snapshot.route, rule)
-    is_informative = query.is_informative and (query.encoding is None or not snapshot.is_strange(query.encoding))
-    belief = belief.updated(evidence, step=0) if is_informative else belief
+    belief = step.state.belief
     summary = summarise(snapshot.route, belief.mass, length, belief.off_route)
     watch.lap("belief")
     plan = None
     if snapshot.view_bits is not None or snapshot.q_values is not None:
-        plan = ActiveLocalizer(snapshot, LocalizerConfig()).plan(LocalizerState(belief, None, relevance, 1))
+        plan = localizer.plan(step.state)
     watch.lap("plan")
-    return Localization(snapshot, relevance, ids, summary, plan, is_informative)
+    return Localization(snapshot, step.relevance, ids, summary, plan, step.shows_place)
 
 
 def is_short(snapshot: Map, view: View, n_shortlist: int | None = None) -> bool:

@@ -7,7 +7,8 @@ from deepsimbad.core.belief.evidence import ViewEvidence
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.experience.nnql import KnownWalk, NnqlConfig, Transitions, initial_q_values, learn, transitions_of
 from deepsimbad.core.experience.training import TrainingWorld, Walk
-from deepsimbad.core.index.retrieval import relevances
+from deepsimbad.core.index.retrieval import relevances, shortlist
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, Relevance, UpdateRule
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
@@ -112,6 +113,25 @@ def test_rewards_and_neighbours_are_those_of_training_on_the_same_moves(world):
         assert moves.next_allowed[t].tolist() == training.allowed[0].tolist()
     assert all(rewards)
     assert 0 < np.count_nonzero(moves.reward) < len(moves.reward)
+
+
+def test_a_robot_that_stands_jitters_or_sees_nothing_is_followed_as_its_session_was(world):
+    map_, ranks = world
+    queries = [Query(ranks[frame]) for frame in (4, 9, 9, 9, 10)]
+    queries[3] = Query.uninformative(R)
+    action_m = np.array([0.0, 5.0, 0.0, -0.1, 1.0])
+    walk = KnownWalk(queries, action_m, np.array([4.0, 9.0, 9.0, 9.0, 10.0]))
+    moves = transitions_of(map_, walk, NnqlConfig(top_share=0.05))
+    localizer, steps = ActiveLocalizer(map_, LocalizerConfig()), []
+    for query, moved_m in zip(queries, action_m.tolist(), strict=True):
+        steps.append(localizer.step(steps[-1].state if steps else localizer.start(), query, moved_m))
+    assert moves.action.tolist() == [2, 0]
+    near = [shortlist(step.relevance, 4).tolist() for step in steps]
+    assert (moves.nearest.tolist(), moves.next_nearest.tolist()) == ([near[0], near[3]], [near[1], near[4]])
+    is_rewarded = [
+        rank_of_truth(steps[t].state.belief.mass, np.array([frame])) < 0.05 * N for t, frame in ((1, 9), (4, 10))
+    ]
+    assert moves.reward.tolist() == [100.0 * earned for earned in is_rewarded]
 
 
 def test_a_rank_counts_from_0_and_must_lie_below_the_share(world):

@@ -13,14 +13,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deepsimbad.core.belief.evidence import ViewEvidence
-from deepsimbad.core.belief.grid import GridFilter
-from deepsimbad.core.belief.motion import motion_std_m
-from deepsimbad.core.index.retrieval import relevances, shortlist
+from deepsimbad.core.index.retrieval import shortlist
+from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, UpdateRule
-from deepsimbad.errors import InvalidInputError, InvalidMapConfigError, PastTheEndError
+from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 
 @dataclass(frozen=True)
@@ -136,36 +134,29 @@ class KnownWalk:
 
 
 def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transitions:
-    """Replay a walk from a uniform belief, and reward its moves as training does.
+    """Replay a walk as a session on the grid that starts anywhere, and reward its moves as training does.
+
+    Where a move leads past the end the session begins anew, with the statistics that it has.
 
     A move counts for the domain's action nearest to it, if that is no farther than half the least step between two
     actions (of a single action, than half of it). Other moves, and those to an unknown place, teach nothing.
     """
     actions_m, route = map_.actions_m, map_.route
     reach_m = np.diff(actions_m).min() / 2 if actions_m.size > 1 else abs(actions_m[0]) / 2
-    rule = config.update or map_.update_rule
-    belief, live = GridFilter.uniform(route, rule), map_.live_statistics
+    localizer = ActiveLocalizer(map_, LocalizerConfig(update=config.update))
+    state = localizer.start()
     nearest: list[NDArray[np.int64]] = []
     outcomes: list[tuple[int, int, float]] = []  # view, action, reward
     for t, query in enumerate(walk.queries):
-        if t > 0:
-            action_m = float(walk.action_m[t])
-            std_m = motion_std_m(action_m) if config.motion_std_m is None else config.motion_std_m
-            try:
-                belief = belief.predicted(action_m, std_m, t)
-            except PastTheEndError:
-                belief = GridFilter.uniform(route, rule)
-        live = None if live is None else live.observing(query)
-        relevance = relevances(map_, query, live)
-        shared_error = map_.shared_error_after(float(walk.action_m[t])) if t > 0 else 0.0
-        belief = belief.updated(ViewEvidence.of(relevance, rule, map_.log_likelihood_scale, shared_error), t)
-        nearest.append(shortlist(relevance, config.n_neighbours))
+        step, _ = localizer.observe_or_restart(state, query, float(walk.action_m[t]), config.motion_std_m)
+        state = step.state
+        nearest.append(shortlist(step.relevance, config.n_neighbours))
         if t == 0 or np.isnan(walk.true_position_m[t]):
             continue
         action = int(np.abs(actions_m - walk.action_m[t]).argmin())
         if abs(actions_m[action] - walk.action_m[t]) <= reach_m:
             truth = route.nearest_image(walk.true_position_m[[t]]).astype(np.int64)
-            is_earned = rank_of_truth(belief.mass, truth) < config.top_share * route.n_images
+            is_earned = rank_of_truth(state.belief.mass, truth) < config.top_share * route.n_images
             outcomes.append((t, action, config.reward * is_earned))
     views = np.array([view for view, _, _ in outcomes], np.int64)
     k = min(config.n_neighbours, route.n_images)

@@ -16,7 +16,6 @@ from deepsimbad.core.belief.summary import CONFIDENT_WITHIN_M, DEFAULT_CONFIDENC
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive, SameRoute
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
-from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
 from deepsimbad.errors import InvalidMapConfigError, PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
@@ -213,7 +212,7 @@ class _Course:
             for frame, action_m in zip(frames, moved_m.tolist(), strict=True):
                 is_refused = False
                 try:
-                    state = self.localizer.step(state, self.drive.views.at(frame), action_m).state
+                    state = self.localizer.observe(state, self.drive.views.at(frame), action_m).state
                 except PastTheEndError:
                     is_refused = True
                 robot.append(_sight(state.belief, int(self.drive.true_image[frame]), is_refused))
@@ -225,8 +224,7 @@ class _Course:
 def _course(
     config: CalibrationConfig, evaluator: Evaluator, map_build: Built, test: Drive, true_image: NDArray[np.int64]
 ) -> _Course:
-    # Nobody follows its plans, and a constant planner's cost nothing.
-    localizer_config = LocalizerConfig(filter=config.filter, planner=f"{CONSTANT}:{_MOVE_M:g}", seed=config.seed)
+    localizer_config = LocalizerConfig(filter=config.filter, seed=config.seed)
     views = views_of(measure_drive(test, map_build.map.landmark_model, evaluator))
     return _Course(ActiveLocalizer(map_build.map, localizer_config), TestDrive(views, test.route(), true_image), config)
 

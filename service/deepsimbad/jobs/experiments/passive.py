@@ -6,7 +6,7 @@ several speeds. All use the same views: a belief that begins so many views ago k
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +17,7 @@ from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig, LocalizerState
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
-from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import Query
-from deepsimbad.errors import PastTheEndError
 
 WINDOWS = (1, 2, 5, 10, 20)  # views
 _MOST_WINDOWS = 500  # of each length; more would only take longer
@@ -72,7 +70,7 @@ def drive_in_order(
         all_relevances: [n] of every frame, relevances of whole unit vectors.
         true_images: For every test frame the map images that count as true.
     """
-    localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{map_.actions_m[0]:g}"))
+    localizer = ActiveLocalizer(map_, LocalizerConfig())
     scorers = {
         name: {n_views: RetrievalScorer() for n_views in WINDOWS}
         for name in (FILTER, SUM, SUM_ANY_SPEED, SUM_BRUTE_FORCE_U)
@@ -84,7 +82,7 @@ def drive_in_order(
     for frame, (truth, frame_relevances) in enumerate(zip(true_images, all_relevances, strict=True)):
         view, move_m = views.at(frame), moved_m[frame]
         if frame in starts:
-            window_states[frame] = replace(localizer.start(), live=state.live)
+            window_states[frame] = localizer.restart(state)
         state = _step(localizer, state, view, move_m)
         drive_scorer.add(state.belief.mass, truth)
         live, _ = map_.after_view(live, view, move_m if frame else None)
@@ -113,14 +111,8 @@ def drive_in_order(
 
 
 def _step(localizer: ActiveLocalizer, state: LocalizerState, view: Query, moved_m: float) -> LocalizerState:
-    """The state after a view; where the move leads past the end it stays.
-
-    The filter takes the odometry for exact, as sums do.
-    """
-    try:
-        return localizer.step(state, view, moved_m, action_std_m=0.0).state
-    except PastTheEndError:
-        return state
+    """The state after a view, by a filter that takes the odometry for exact, as sums do."""
+    return localizer.observe_or_restart(state, view, moved_m, action_std_m=0.0)[0].state
 
 
 def _sum_views(

@@ -16,9 +16,7 @@ from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
-from deepsimbad.core.planners import CONSTANT
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Query
-from deepsimbad.errors import PastTheEndError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.jobs.build import build, measure_drive, views_of
 from deepsimbad.jobs.experiments.truth import nearest_images
@@ -160,22 +158,12 @@ def _in_order(map_: Map, views: Query, queries: Drive) -> Iterator[tuple[NDArray
 
     Yields the relevance of every map image to each view, [n], the belief after it, and whether it began anew.
     """
-    # Nobody follows its plans, and a constant planner's cost nothing.
-    localizer = ActiveLocalizer(map_, LocalizerConfig(planner=f"{CONSTANT}:{CONFIDENT_WITHIN_M:g}"))
+    localizer = ActiveLocalizer(map_, LocalizerConfig())
     state = localizer.start()
     for row, move_m in enumerate(np.diff(queries.position_m, prepend=queries.position_m[0]).tolist()):
-        view, has_forgotten = views.at(row), False
-        try:
-            state = localizer.step(state, view, move_m).state
-        except PastTheEndError:  # it was believed elsewhere: it goes on from an even belief, but keeps its statistics
-            route = state.belief.route
-            reset_state = localizer.with_prior(
-                state, route.start_m + route.length_m / 2, 100 * max(route.length_m, 1.0)
-            )
-            state, has_forgotten = localizer.step(reset_state, view).state, True
-        if state.relevance is None:
-            raise ValueError("a step leaves the view's relevance")
-        yield state.relevance, state.belief, has_forgotten
+        step, has_forgotten = localizer.observe_or_restart(state, views.at(row), move_m)
+        state = step.state
+        yield step.relevance, state.belief, has_forgotten
 
 
 def _outcome(
