@@ -225,9 +225,6 @@ def replay(
     out: Path | None,
     tolerance_m: float | None,
     planners: tuple[str, ...],
-    episodes: int | None,
-    steps: int | None,
-    seed: int | None,
     restart: bool,
     plots: bool,
     rerun: bool,
@@ -237,6 +234,7 @@ def replay(
     allow_missing: bool,
     verbose: bool,
     json_output: bool,
+    **active_options: Any,
 ) -> None:
     """Localize every frame of a recording, score the answers; with --planner, drive along it as an active robot.
 
@@ -244,9 +242,9 @@ def replay(
     it, and looks again. Writes steps.jsonl, summary.json, pictures, and index.html, a page of all; interrupted, the
     same command goes on where it stopped.
     """
-    active_only = {"--episodes": episodes, "--steps": steps, "--seed": seed}
-    if not planners and any(value is not None for value in active_only.values()):
-        raise click.UsageError(f"{', '.join(active_only)} belong to an active replay: give --planner too")
+    active = {name: value for name, value in active_options.items() if value is not None}
+    if active and not planners:
+        raise click.UsageError("--episodes, --steps, --seed belong to an active replay: give --planner too")
     if planners and tolerance_m is not None:
         raise click.UsageError("--tolerance belongs to a passive replay: an active one ranks the nearest map image")
     recording = open_recording(source, allow_missing, **reading)
@@ -256,20 +254,9 @@ def replay(
         viewers = _viewers(rerun, mcap, open_viewers)
         common: dict[str, Any] = {"concurrency": concurrency, "restart": restart, "viewers": viewers}
         if planners:
-            episodes = EPISODES if episodes is None else episodes
-            with EpisodeBar(name, len(dict.fromkeys(planners)) * episodes) as bar:
-                active_result = active_replay(
-                    client,
-                    recording,
-                    domain,
-                    folder,
-                    planners=planners,
-                    episodes=episodes,
-                    steps=STEPS if steps is None else steps,
-                    seed=seed or 0,
-                    on_progress=bar,
-                    **common,
-                )
+            with EpisodeBar(name, len(dict.fromkeys(planners)) * active.get("episodes", EPISODES)) as bar:
+                options = {**common, **active, "planners": planners, "on_progress": bar}
+                active_result = active_replay(client, recording, domain, folder, **options)
             summary = summarise_active(active_result)
             tables = active_tables(summary)
         else:

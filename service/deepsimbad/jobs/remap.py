@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from deepsimbad.core.building import MapPlan, SeenTwice
+from deepsimbad.core.building import Built, MapPlan, SeenTwice
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.frames import Camera
@@ -25,7 +25,7 @@ from deepsimbad.errors import (
     UnknownTraverseError,
     WeightsDifferError,
 )
-from deepsimbad.evaluators.base import Evaluator, Fitting
+from deepsimbad.evaluators.base import Evaluator, Fitting, LandmarkModel
 from deepsimbad.evaluators.grey_levels import with_levels
 from deepsimbad.jobs.append import (
     ACTIVE_MAP,
@@ -278,34 +278,8 @@ class _Remap:
 
     def _map_traverse(self, inputs: _Inputs) -> _Draft:
         """Map the training traverse by itself."""
-        config, domain, training = self.config, inputs.domain, inputs.training
-        landmarks = inputs.candidates if inputs.base is None else inputs.base.landmark_model
-        n_candidates = (inputs.candidates or training).n_frames
-        n_landmarks = (
-            fitting_number(config.n_landmarks, n_candidates, DEFAULT_N_LANDMARKS)
-            if inputs.base is None
-            else inputs.base.n_landmarks
-        )
-        plan = MapPlan(config.relevance, config.list_length, domain.actions_m, domain.closed, config.same_route)
-        candidates = inputs.candidates or training
-        with Traverse.open(self.catalog.data_dir, self.domain, candidates.name or "") as traverse:
-            fitter = Fitter(self.evaluator, SpooledPictures(traverse, candidates, self.pictures), config.seed)
-            if inputs.base is None and fitting_of(self.evaluator, config.relevance) is not Fitting.NOTHING:
-                self.progress.stage(FIT)
-                other = inputs.second if candidates is training else training
-                fitter.fit(plan, candidates, n_landmarks, other, self.progress.update)
-            self.progress.stage("describe")
-            map_build = build(
-                plan,
-                training,
-                inputs.second,
-                landmarks,
-                n_landmarks,
-                self.evaluator,
-                self.progress.update,
-                inputs.camera,
-                fitter,
-            )
+        config, domain, training, base = self.config, inputs.domain, inputs.training, inputs.base
+        map_build = self._build(inputs)
         q_values = learning = None
         # The baseline that compares whole encodings would need hours for it, and serves no robot.
         if config.training_episodes and config.relevance.traits.is_listed:
@@ -319,7 +293,7 @@ class _Remap:
                 self.n_threads,
             )
         config_document = config.as_dict()
-        landmark_source = inputs.base or inputs.candidates
+        landmark_source = base or inputs.candidates
         weights_sha256 = training.weights_sha256 or (landmark_source and landmark_source.weights_sha256)
         if weights_sha256 is not None:
             config_document["weights_sha256"] = weights_sha256
@@ -332,22 +306,49 @@ class _Remap:
             config={**config_document, **map_build.map.config},
             landmark_model=with_levels(map_build.map.landmark_model, training.grey_levels),
             **training.origins(),
-            **({} if inputs.base is None else inputs.base.landmark_origins()),
+            **({} if base is None else base.landmark_origins()),
             q_values=q_values,
         )
-        second_season = None
-        if map_build.same_route is not None and inputs.second is not None:
-            second_season = {**map_build.same_route.as_dict(), "traverse": inputs.second.name}
-        source = TRAINING if landmarks is None else LANDMARK_TRAVERSE if inputs.base is None else ACTIVE_MAP
-        results: dict[str, Any] = {"landmarks": source, "training": learning, "second_season": second_season}
-        results["camera_of"] = config.camera_of if map_build.by_camera else None
-        if map_build.fitting is not None:
-            results["fitting"] = dict(map_build.fitting)
-        results["warnings"] = [
-            *map_build.warnings,
-            *(() if map_build.same_route is None else map_build.same_route.remarks()),
-        ]
+        same_route, second_season = map_build.same_route, None
+        if same_route is not None and inputs.second is not None:
+            second_season = {**same_route.as_dict(), "traverse": inputs.second.name}
+        results = {
+            "landmarks": ACTIVE_MAP if base else LANDMARK_TRAVERSE if inputs.candidates else TRAINING,
+            "training": learning,
+            "second_season": second_season,
+            "camera_of": config.camera_of if map_build.by_camera else None,
+            **({} if map_build.fitting is None else {"fitting": dict(map_build.fitting)}),
+            "warnings": [*map_build.warnings, *(() if same_route is None else same_route.remarks())],
+        }
         return map_, map_, config_document, results
+
+    def _build(self, inputs: _Inputs) -> Built:
+        """Choose landmarks, fit the evaluator to them where it learns, and describe the training traverse by them."""
+        config, domain, training, base = self.config, inputs.domain, inputs.training, inputs.base
+        candidates = inputs.candidates or training
+        landmarks: Drive | LandmarkModel | None = inputs.candidates
+        n_landmarks = fitting_number(config.n_landmarks, candidates.n_frames, DEFAULT_N_LANDMARKS)
+        if base is not None:
+            landmarks, n_landmarks = base.landmark_model, base.n_landmarks
+        plan = MapPlan(config.relevance, config.list_length, domain.actions_m, domain.closed, config.same_route)
+        with Traverse.open(self.catalog.data_dir, self.domain, candidates.name or "") as traverse:
+            fitter = Fitter(self.evaluator, SpooledPictures(traverse, candidates, self.pictures), config.seed)
+            if base is None and fitting_of(self.evaluator, config.relevance) is not Fitting.NOTHING:
+                self.progress.stage(FIT)
+                other = inputs.second if candidates is training else training
+                fitter.fit(plan, candidates, n_landmarks, other, self.progress.update)
+            self.progress.stage("describe")
+            return build(
+                plan,
+                training,
+                inputs.second,
+                landmarks,
+                n_landmarks,
+                self.evaluator,
+                self.progress.update,
+                inputs.camera,
+                fitter,
+            )
 
     def _append_traverse(self, inputs: _Inputs, old_map: Map, frames: CheckFrames) -> _Draft:
         """Fuse the training traverse into the images of a copy of the active map, or add its frames to them."""
