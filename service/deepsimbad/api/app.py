@@ -60,7 +60,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import service_lock
 from deepsimbad.store.records import JobRecord, KeyRecord, ListPage
 from deepsimbad.store.sessions import SessionRecord, SessionStore
-from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
+from deepsimbad.store.shared_catalog import open_catalog
 
 router = APIRouter(tags=["health"], route_class=StrictRoute)
 log = logging.getLogger(__name__)
@@ -165,20 +165,19 @@ async def follow(services: Services) -> None:
             log.exception("a new map cannot be served", extra={"domain": domain})
         return True
 
-    def catch_up(catalog: SharedCatalog) -> set[str]:
+    def catch_up() -> set[str]:
         """Take over all domains that changed; the names of those that were deleted."""
-        with catalog.follow_lock:  # who asks meanwhile waits until what has been read is served
-            return {domain for domain in catalog.follow() if not take_over(domain)}
+        with services.catalog.follow_lock:  # who asks meanwhile waits until what has been read is served
+            return {domain for domain in services.catalog.follow() if not take_over(domain)}
 
-    if isinstance(services.catalog, SharedCatalog):
-        deleted_domains = await run_sync(catch_up, services.catalog)
-        await services.sessions.end_those(lambda session: session.domain in deleted_domains)
+    deleted_domains = await run_sync(catch_up)
+    await services.sessions.end_those(lambda session: session.domain in deleted_domains)
 
 
 async def _keep_following(services: Services) -> None:
     """Follow the map store again and again. A failure is logged once; what is in memory goes on to serve."""
     is_failing = False
-    while isinstance(services.catalog, SharedCatalog):
+    while services.catalog.is_shared:
         await asyncio.sleep(_FOLLOW_S)
         try:
             await follow(services)
@@ -215,14 +214,13 @@ async def _sweep(services: Services) -> None:
 def _current_catalog(settings: Settings, administrator: int | None) -> Catalog:
     """The catalog; one that is shared knows what others published, as far as the store can be reached."""
     catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes, administrator)
-    if isinstance(catalog, SharedCatalog):
-        try:
-            catalog.catch_up()
-        except UnavailableError as error:  # what is here can be served
-            log.warning("the map store cannot be followed", extra={"why": error.message})
-        except BaseException:
-            catalog.close()
-            raise
+    try:
+        catalog.catch_up()
+    except UnavailableError as error:  # what is here can be served
+        log.warning("the map store cannot be followed", extra={"why": error.message})
+    except BaseException:
+        catalog.close()
+        raise
     return catalog
 
 
@@ -263,10 +261,9 @@ def _start(
         keep_ended_s=settings.keep_ended_sessions_s,
     )
     parts.callback(live_sessions.close)
-    if isinstance(catalog, SharedCatalog):
-        catalog.is_in_use = lambda domain, version, digest: (
-            maps_.holds(domain, version, digest) or (domain, version) in SessionStore.pins(store)  # of those read here
-        )
+    catalog.is_in_use = lambda domain, version, digest: (
+        maps_.holds(domain, version, digest) or (domain, version) in SessionStore.pins(store)  # of those read here
+    )
     open_traverses = OpenTraverses(settings.data_dir)
     parts.callback(open_traverses.close)
 

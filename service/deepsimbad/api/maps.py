@@ -30,8 +30,8 @@ from deepsimbad.api.requests import (
     read_json,
 )
 from deepsimbad.engine.maps import load_snapshot, unreadable_error
-from deepsimbad.errors import ConflictError, DamagedMapError, UnknownMapVersionError
-from deepsimbad.store.catalog_maps import ANY, removal_error
+from deepsimbad.errors import ConflictError, DamagedMapError
+from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.records import MapState
 
 router = APIRouter(prefix="/v1/admin/domains", tags=["admin: maps"], route_class=StrictRoute)
@@ -144,16 +144,12 @@ async def get_map_file(
     """
 
     def check() -> tuple[Path, str, int]:
-        record = services.catalog.map(domain, version)
-        if record.removed_at is not None:
-            raise removal_error(domain, version)
-        if record.sha256 is None:
-            raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+        sha256 = services.catalog.sealed_digest(domain, version)
         try:
             path = services.catalog.map_file(domain, version)
         except DamagedMapError as error:
             raise unreadable_error(services.catalog, domain, version) from error
-        return path, record.sha256, path.stat().st_size
+        return path, sha256, path.stat().st_size
 
     path, sha256, n_bytes = await run_sync(check)
     etag = f'"sha256:{sha256}"'

@@ -31,7 +31,7 @@ from deepsimbad.jobs.progress import Progress, ProgressState
 from deepsimbad.settings import Settings, TracedSettings, trace_settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import catalog_path
-from deepsimbad.store.shared_catalog import SharedCatalog, open_catalog
+from deepsimbad.store.shared_catalog import open_catalog
 from deepsimbad_client.tables import print_whole
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -113,11 +113,10 @@ def open_given_catalog() -> Catalog:
     """The catalog of the data directory, which follows a map store where settings say so or it did before."""
     settings = given_settings()
     catalog = open_catalog(settings.data_dir, settings.map_store, settings.map_cache_disk_bytes)
-    if isinstance(catalog, SharedCatalog):
-        try:
-            catalog.catch_up()
-        except UnavailableError as error:  # what is here can be asked
-            click.echo(f"what others published since is not known: {error.message}", err=True)
+    try:
+        catalog.catch_up()
+    except UnavailableError as error:  # what is here can be asked
+        click.echo(f"what others published since is not known: {error.message}", err=True)
     return catalog
 
 

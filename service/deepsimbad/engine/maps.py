@@ -318,12 +318,7 @@ class Maps:
             RetiredMapError: It was removed.
             DamagedMapError: Its file is damaged, or missing though the version serves.
         """
-        record = self._catalog.settled_map(domain, version)
-        if record.removed_at is not None:
-            raise removal_error(domain, version)
-        if record.sha256 is None:
-            raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
-        return self.pinned(domain, version, record.sha256).snapshot
+        return self.pinned(domain, version, self._catalog.sealed_digest(domain, version)).snapshot
 
 
 class Retention:

@@ -83,6 +83,8 @@ class Catalog(MapCatalog, JobCatalog):
     used, beside what it names itself.
     """
 
+    is_shared = False  # whether other machines change it too, by a map store
+
     @classmethod
     def open(cls, data_dir: Path) -> Self:
         """Open the catalog of a data directory; makes both where they are missing."""
@@ -99,6 +101,13 @@ class Catalog(MapCatalog, JobCatalog):
             db = open_working_file(path, migrations, create=not has_domains)
             sync(data_dir)
             return cls(data_dir, db)
+
+    def follow(self) -> list[str]:
+        """Take over what other machines have published, where it is shared; answers which domains changed."""
+        return []
+
+    def catch_up(self) -> None:
+        """Follow, and publish what other machines do not know, where it is shared."""
 
     def create_domain(
         self,

@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import threading
 from collections.abc import Callable, Collection, Sequence
 from enum import Enum
 from pathlib import Path
@@ -51,10 +52,14 @@ ANY: Final = AnyVersion.ANY
 class MapCatalog(OpenFile):
     """The map versions of all domains, and the locks of those that this process builds."""
 
+    is_in_use: Callable[[str, int, str], bool] = staticmethod(lambda _domain, _version, _sha256: False)
+    """Whether a map, by its domain, version and digest, is in memory or pinned: where it is shared its file stays."""
+
     def __init__(self, data_dir: Path, db: Database) -> None:
         path = layout.catalog_path(data_dir)
         super().__init__(path, db, open_database(path))  # a robot's answer needs the catalog: it waits for no writer
         self.data_dir = data_dir
+        self.follow_lock = threading.Lock()  # held by a caller of `follow` until the changes are served
         self._building_locks: dict[tuple[str, int], int] = {}  # descriptors of locked folders
 
     def close(self) -> None:
@@ -259,6 +264,20 @@ class MapCatalog(OpenFile):
         """As `map`, after any change that this process is making: a removal is done, or has not begun."""
         with self._lock:
             return self.map(domain, version)
+
+    def sealed_digest(self, domain: str, version: int) -> str:
+        """The digest of a version that was sealed and not removed, after any change that this process is making.
+
+        Raises:
+            UnknownDomainError, UnknownMapVersionError: There is no such version, or it is still being built.
+            RetiredMapError: Its file was removed.
+        """
+        record = self.settled_map(domain, version)
+        if record.removed_at is not None:
+            raise removal_error(domain, version)
+        if record.sha256 is None:
+            raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+        return record.sha256
 
     def serving_maps(self, domains: Collection[str]) -> dict[str, MapRecord]:
         """The active versions of these domains, as far as there are any."""

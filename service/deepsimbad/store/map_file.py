@@ -21,7 +21,6 @@ from deepsimbad.errors import (
     InvalidMapConfigError,
     InvalidRouteError,
     NoActiveMapError,
-    UnknownMapVersionError,
 )
 from deepsimbad.store.arrays import (
     Checksum,
@@ -33,7 +32,6 @@ from deepsimbad.store.arrays import (
     unpack_texts,
 )
 from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.catalog_maps import removal_error
 from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, verify, written_aside
 from deepsimbad.store.records import MapRecord, from_json, to_json
@@ -321,15 +319,11 @@ def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -
         version = catalog.domain(domain).active_version
         if version is None:
             raise NoActiveMapError(f"domain {domain} has no active map: name another with --version", domain=domain)
-    record = catalog.map(domain, version)
-    if record.removed_at is not None:
-        raise removal_error(domain, version)
-    if record.sha256 is None:
-        raise UnknownMapVersionError(f"map {version} of domain {domain} is still being built", version=version)
+    sha256 = catalog.sealed_digest(domain, version)
     try:
         with storage_faults(file), written_aside(file, "an export") as new_path:
             shutil.copyfile(catalog.map_file(domain, version), new_path)
-            verify(new_path, record.sha256)
+            verify(new_path, sha256)
             new_path.chmod(0o444)
     except DamagedMapError as error:
         raise DamagedMapError(
@@ -337,4 +331,4 @@ def export_map(catalog: Catalog, domain: str, version: int | None, file: Path) -
             domain=domain,
             map_version=version,
         ) from error
-    return record
+    return catalog.map(domain, version)

@@ -4,7 +4,6 @@ Every such catalog is a copy of the log as far as it was read, and changes share
 """
 
 import os
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -93,14 +92,12 @@ class SharedCatalog(Catalog):
 
     store: MapStore
     _cache: MapCache
-    is_in_use: Callable[[str, int, str], bool] = staticmethod(lambda _domain, _version, _sha256: False)
-    """Whether a map, by its domain, version and digest, is in memory or pinned, and keeps its file."""
+    is_shared = True
     administrator: int = 0
     """Which of several that administer has the data directory; it is kept with the domains that are made here."""
 
     def __init__(self, data_dir: Path, db: Database) -> None:
         super().__init__(data_dir, db)
-        self.follow_lock = threading.Lock()  # held by a caller of `follow` until the changes are served
         self._transaction: Database | None = None
         self._is_trying = False
 
@@ -136,7 +133,7 @@ class SharedCatalog(Catalog):
     # Following
 
     def follow(self) -> list[str]:
-        """Read on in the log; answers which domains changed.
+        """As `Catalog.follow`, by reading on in the log.
 
         Raises:
             DomainDiffersError: A domain that was published has the name of another that was made here.
