@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from queue import Empty, PriorityQueue
 from time import monotonic, perf_counter
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -129,13 +129,16 @@ class Priority(IntEnum):
     _CLOSE = 2
 
 
+class _Encoding(NamedTuple):
+    evaluator: Evaluator
+    view: Image | Scene
+
+
 @dataclass(order=True)
 class _Work:
     priority: Priority
     arrival: int
-    run: Callable[[], Any] = field(compare=False, default=lambda: None)
-    evaluator: Evaluator | None = field(default=None, compare=False)
-    view: Image | Scene | None = field(default=None, compare=False)
+    task: Any = field(compare=False, default=None)  # a function, or of a line of images an `_Encoding`
     answer: Future[Any] = field(default_factory=Future, compare=False)
 
 
@@ -157,9 +160,9 @@ class _Line:
         """How many pieces of work wait."""
         return self._queue.qsize()
 
-    def join(self, priority: Priority, **fields: Any) -> Future[Any]:
-        """Put work with these `fields` in line; raises UnavailableError and OverloadedError."""
-        work = _Work(priority, next(self._arrivals), **fields)
+    def join(self, priority: Priority, task: Callable[[], Any] | _Encoding) -> Future[Any]:
+        """Put a task in line; raises UnavailableError and OverloadedError."""
+        work = _Work(priority, next(self._arrivals), task)
         with self._lock:
             if not self._is_open:
                 raise UnavailableError("the service is shutting down")
@@ -198,7 +201,7 @@ class _Line:
         """Do the work and set its answers."""
         for work in batch:
             try:
-                result = work.run()
+                result = work.task()
             except BaseException as error:
                 work.answer.set_exception(error)
             else:
@@ -213,10 +216,10 @@ class _EncodingLine(_Line):
         super().__init__(name, max_waiting)
 
     def _with_company(self, first: _Work) -> list[_Work]:
-        assert first.evaluator is not None
+        evaluator: Evaluator = first.task.evaluator
         batch, deadline_s = [first], monotonic() + self._longest_wait_s
         try:
-            largest_batch = first.evaluator.largest_batch
+            largest_batch = evaluator.largest_batch
         except Exception:  # its network cannot be loaded, which encoding it will tell
             return batch
         while len(batch) < largest_batch:
@@ -225,7 +228,7 @@ class _EncodingLine(_Line):
                 next_work = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
             except Empty:
                 break
-            if next_work.evaluator is not first.evaluator:
+            if next_work.task.evaluator is not evaluator:
                 self._queue.put(next_work)  # in its old place: the order is by priority and arrival
                 break
             batch.append(next_work)
@@ -235,9 +238,8 @@ class _EncodingLine(_Line):
         """Encode the batch; where that fails encode each alone, so that only those at fault fail."""
         if not batch:
             return
-        assert batch[0].evaluator is not None
         try:
-            encoded = encode_images(batch[0].evaluator, [work.view for work in batch if work.view is not None])
+            encoded = encode_images(batch[0].task.evaluator, [work.task.view for work in batch])
             answers = list(zip(batch, encoded, strict=True))
         except BaseException as error:
             if len(batch) == 1:
@@ -287,13 +289,13 @@ class InferenceWorker:
             UnavailableError: The worker has been closed.
             OverloadedError: The limit on waiting work is reached.
         """
-        return self._long_work.join(priority, run=run)
+        return self._long_work.join(priority, run)
 
     def encode(
         self, evaluator: Evaluator, view: Image | Scene, priority: Priority = Priority.LIVE
     ) -> Future[EncodedImage]:
         """Queue an image or a scene to be encoded; returns and raises as `submit`."""
-        return self._encoding.join(priority, evaluator=evaluator, view=view)
+        return self._encoding.join(priority, _Encoding(evaluator, view))
 
     async def computed(self, run: Callable[[], T], *, is_short: bool = False) -> T:
         """The result of a function, which runs on the event loop where it is short, else on the worker."""

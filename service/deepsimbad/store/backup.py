@@ -304,8 +304,8 @@ def _unpack(tar: tarfile.TarFile, file: Path, member: dict[str, Any], staging: P
     target = staging / name
     target.parent.mkdir(parents=True, exist_ok=True)
     stream, migrations = tar.extractfile(name), migrations_of(name)
-    assert stream is not None
-    assert migrations is not None
+    if stream is None or migrations is None:
+        raise _invalid_archive(file, f"{name!a} has no place in it")
     with target.open("xb") as output:
         try:
             shutil.copyfileobj(stream, output)

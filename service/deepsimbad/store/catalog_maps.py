@@ -81,9 +81,8 @@ class MapCatalog(OpenFile):
             db.table("domain").update(domain, {"next_version": version + 1})
             row = {"domain": domain, "version": version, "state": MapState.BUILDING, "created_at": current_moment()}
             db.table("map").insert({**row, "config": to_json(config), "metrics": "{}"})
-            descriptor = lock_folder(layout.maps_folder(self.data_dir, domain), fcntl.LOCK_SH)
-            assert descriptor is not None
-            self._building_locks[domain, version] = descriptor
+            folder = layout.maps_folder(self.data_dir, domain)
+            self._building_locks[domain, version] = lock_folder(folder, fcntl.LOCK_SH)
         return int(version)
 
     def seal_map(self, domain: str, version: int, sha256: str, file_bytes: int, metrics: dict[str, Any]) -> MapRecord:
@@ -136,9 +135,10 @@ class MapCatalog(OpenFile):
             descriptor = lock_folder(layout.maps_folder(self.data_dir, domain), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except FileNotFoundError:
             return False
-        if descriptor is not None:
-            os.close(descriptor)
-        return descriptor is None
+        except BlockingIOError:
+            return True
+        os.close(descriptor)
+        return False
 
     def _unlock_building(self, domain: str, version: int) -> None:
         descriptor = self._building_locks.pop((domain, version), None)

@@ -181,10 +181,10 @@ def empty_graves(parent: Path) -> None:
         shutil.rmtree(grave, ignore_errors=True)
 
 
-def lock_folder(folder: Path, operation: int) -> int | None:
+def lock_folder(folder: Path, operation: int) -> int:
     """Open and lock a folder (`fcntl.flock`); the lock ends with the descriptor, or with the process in any way.
 
-    Returns None where LOCK_NB was asked for and another holds it. Raises OSError.
+    Raises OSError: BlockingIOError where LOCK_NB was asked for and another holds it.
     """
     while True:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -192,9 +192,6 @@ def lock_folder(folder: Path, operation: int) -> int | None:
             fcntl.flock(descriptor, operation)
             if folder.stat().st_ino == os.fstat(descriptor).st_ino:  # else another has taken its place meanwhile
                 return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
-            return None
         except BaseException:
             os.close(descriptor)
             raise
@@ -222,18 +219,19 @@ def service_lock(data_dir: Path, description: str) -> Iterator[None]:
     make_data_dir(data_dir)
     file = service_lock_path(data_dir)
     with storage_faults(data_dir):
-        descriptor = lock_folder(data_dir, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    if descriptor is None:
-        holder: dict[str, object] = {}
-        with suppress(OSError, ValueError):  # it may not have come to that yet
-            holder = dict(json.loads(file.read_text(encoding="utf-8")))
-        pid, address = holder.get("pid"), holder.get("address")
-        raise DataDirInUseError(
-            f"another service (process {pid or 'unknown'}, listening on {address or 'an unknown address'}) runs on "
-            f"the data directory {data_dir}: stop it, or name another --data-dir",
-            pid=pid,
-            address=address,
-        )
+        try:
+            descriptor = lock_folder(data_dir, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder: dict[str, object] = {}
+            with suppress(OSError, ValueError):  # it may not have come to that yet
+                holder = dict(json.loads(file.read_text(encoding="utf-8")))
+            pid, address = holder.get("pid"), holder.get("address")
+            raise DataDirInUseError(
+                f"another service (process {pid or 'unknown'}, listening on {address or 'an unknown address'}) runs on "
+                f"the data directory {data_dir}: stop it, or name another --data-dir",
+                pid=pid,
+                address=address,
+            ) from error
     try:
         with storage_faults(data_dir):
             try:

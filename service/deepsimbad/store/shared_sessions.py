@@ -242,9 +242,8 @@ class SharedSessionStore(SessionStore):
             if (shared_body := self._objects.get(name)) is not None:
                 save(number, np.frombuffer(shared_body, "<f8"), received_at).result()
             earlier_m = save(number, position_m, received_at).result()
-            merged_m = self.true_positions(number)
-            assert merged_m is not None
-            self._objects.put(name, merged_m.tobytes())
+            if (merged_m := self.true_positions(number)) is not None:  # else the session was purged this moment
+                self._objects.put(name, merged_m.tobytes())
             return earlier_m
 
         return self._writers.submit(write)

@@ -469,7 +469,6 @@ def _locked_folder(folder: Path, domain: str) -> Iterator[None]:
         descriptor = lock_folder(folder, fcntl.LOCK_EX)
     except FileNotFoundError as error:
         raise UnknownDomainError(f"there is no domain {domain}") from error
-    assert descriptor is not None
     try:
         yield
     finally:
