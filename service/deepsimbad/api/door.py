@@ -76,8 +76,8 @@ class Door:
     """ASGI middleware around all routes.
 
     A request counts as under way from when its body has come to when its answer begins: whoever sends or reads slowly
-    takes memory for what was sent, but nobody's turn. Health, readiness and metrics need no
-    key and no turn.
+    takes memory for what was sent, but nobody's turn. Health, readiness and metrics need no key and no turn; while no
+    key exists they too refuse a foreign Host or Origin.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
@@ -257,10 +257,8 @@ class _Request:
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
         metrics.end_request(method, route, self.status, seconds)
-        state, log_fields = scope["state"] | (scope.get("path_params") or {}), {}
-        for name in _LOG_FIELDS:
-            if name in state:
-                log_fields[name] = state[name]
+        state = scope["state"] | (scope.get("path_params") or {})
+        log_fields = {name: state[name] for name in _LOG_FIELDS if name in state}
         if log_fields.get("code") in REFUSALS:
             metrics.count_refusal(log_fields.get("limit", log_fields["code"]))
         if log.isEnabledFor(logging.INFO):
@@ -279,9 +277,8 @@ class _Request:
         self._was_counted, self._n_turns = True, 1
 
     def _too_large(self, complaint: str) -> BodyTooLargeError:
-        max_bytes = self._max_bytes
         return BodyTooLargeError(
-            f"{complaint}; at most {max_bytes} are taken here, send less at once", max_bytes=max_bytes
+            f"{complaint}; at most {self._max_bytes} are taken here, send less at once", max_bytes=self._max_bytes
         )
 
 
