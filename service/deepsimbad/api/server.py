@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from deepsimbad.api.app import create_app
 from deepsimbad.errors import SettingsError, UnavailableError
+from deepsimbad.jobs.child import extras
 from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.layout import catalog_path
@@ -30,14 +30,6 @@ log = logging.getLogger(__name__)
 
 _LONGEST_HOLD_S = 0.0005  # of the interpreter while others wait: at Python's 5 ms encoders stand still beside an answer
 _ENCODER = json.JSONEncoder(default=str)
-_N_STANDARD = len(logging.makeLogRecord({}).__dict__)
-_STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
-
-
-def _extras(record: logging.LogRecord) -> dict[str, Any]:
-    """The `extra` fields of a record, without those of libraries, which begin with an underscore."""
-    items = islice(record.__dict__.items(), _N_STANDARD, None)
-    return {name: value for name, value in items if name not in _STANDARD and not name.startswith("_")}
 
 
 class JsonFormatter(logging.Formatter):
@@ -51,7 +43,7 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        line |= _extras(record)
+        line |= extras(record)
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return _ENCODER.encode(line)
@@ -62,7 +54,7 @@ class PlainFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Render a record."""
-        fields = [f"{name}={value}" for name, value in _extras(record).items() if value not in (None, {}, [])]
+        fields = [f"{name}={value}" for name, value in extras(record).items() if value not in (None, {}, [])]
         level = "" if record.levelno <= logging.INFO else f"{record.levelname}: "
         clock_time = time.strftime("%H:%M:%S", time.localtime(record.created))
         line = "  ".join([f"{clock_time}  {level}{record.getMessage()}", *fields])

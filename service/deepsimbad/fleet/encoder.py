@@ -1,6 +1,7 @@
 """The networks of the fleet, in processes of their own: views of all replicas share one copy, and batches."""
 
 import asyncio
+from collections.abc import Awaitable
 from concurrent.futures import Future
 from typing import Any
 
@@ -13,6 +14,14 @@ from deepsimbad.evaluators.registry import EvaluatorConfig
 from deepsimbad.evaluators.scenes import Scene
 from deepsimbad.fleet.backend import AWAY_S, Backend, Gone
 from deepsimbad.settings import Settings
+
+
+async def answer_or_error(call: Awaitable[Any]) -> Any:
+    """A call's answer, or the error of ours that it raises: errors that Serve raises are of ended processes."""
+    try:
+        return await call
+    except DeepSimbadError as error:
+        return error.with_traceback(None)
 
 
 class Encoder:
@@ -35,11 +44,8 @@ class Encoder:
         await asyncio.sleep(seconds)
 
     async def ask(self, method: str, *arguments: Any) -> Any:
-        """A method's answer, or the error of ours that it raises: errors that Serve raises are of ended processes."""
-        try:
-            return await getattr(self, method)(*arguments)
-        except DeepSimbadError as error:
-            return error.with_traceback(None)
+        """As `answer_or_error`."""
+        return await answer_or_error(getattr(self, method)(*arguments))
 
     async def facts(self, config: EvaluatorConfig) -> NetworkFacts:
         evaluator = self._of(config)

@@ -33,7 +33,7 @@ from deepsimbad.engine.maps import MappedDomain
 from deepsimbad.engine.worker import Stopwatch
 from deepsimbad.errors import DeepSimbadError, NotLoadedError, UnavailableError, UnknownDomainError, UnknownJobError
 from deepsimbad.fleet.backend import AWAY_S, BRIEFLY_S, Backend
-from deepsimbad.fleet.encoder import AskedEncoder, Encoder
+from deepsimbad.fleet.encoder import AskedEncoder, Encoder, answer_or_error
 from deepsimbad.fleet.owners import AskedOwners
 from deepsimbad.fleet.placement import session_owners
 from deepsimbad.jobs.runner import RunJob
@@ -274,10 +274,7 @@ class Replica:
 
     async def answer(self, method: str, *arguments: Any) -> Any:
         """The answer of `gather_heads` or `part`, or the error of ours that it raises."""
-        try:
-            return await getattr(self, method)(*arguments)
-        except DeepSimbadError as error:
-            return error.with_traceback(None)
+        return await answer_or_error(getattr(self, method)(*arguments))
 
     async def gather_heads(
         self, names: Sequence[str], is_all: bool
@@ -350,11 +347,11 @@ class Replica:
 def _new_folder() -> Path:
     """An empty folder for this process; those of processes that were killed are removed."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
-        with suppress(OSError):  # another user's
+        with suppress(OSError):  # another user's, or one in use
             process = Path("/proc", folder.name.removeprefix(_FOLDER_PREFIX).partition("-")[0], "exe")
             if process.exists():  # of one that ended and is not yet reaped it does not
                 continue
-            if (descriptor := lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-                os.close(descriptor)
+            descriptor = lock_folder(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(descriptor)
     return Path(tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-"))

@@ -18,6 +18,7 @@ import threading
 import traceback
 from contextlib import suppress
 from enum import StrEnum
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,15 @@ _LOWEST_NICE = 19
 _PR_SET_PDEATHSIG = 1
 _KILL_ME_FIRST = 500  # of 1000: where memory runs out, the kernel shall end the job rather than the service
 _ORPHANED = 3  # exit code
+_N_STANDARD = len(logging.makeLogRecord({}).__dict__)
+_STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
 _write_lock = threading.Lock()
+
+
+def extras(record: logging.LogRecord) -> dict[str, Any]:
+    """The `extra` fields of a log record, without those of libraries, which begin with an underscore."""
+    items = islice(record.__dict__.items(), _N_STANDARD, None)
+    return {name: value for name, value in items if name not in _STANDARD and not name.startswith("_")}
 
 
 class JobPriority(StrEnum):
@@ -61,11 +70,9 @@ def _tell(**message: Any) -> None:
 class _LogToParent(logging.Handler):
     """Sends log records as messages."""
 
-    _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "taskName"}
-
     def emit(self, record: logging.LogRecord) -> None:
         """Send one record."""
-        extra = {name: value for name, value in record.__dict__.items() if name not in self._PLAIN}
+        extra = extras(record)
         if record.exc_info:
             extra["exception"] = logging.Formatter().formatException(record.exc_info)
         _tell(log={"name": record.name, "levelno": record.levelno, "msg": record.getMessage(), "extra": extra})
