@@ -25,6 +25,7 @@ from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings.sources import open_source
 
 N_LANDMARKS, N_CAMPUS_LANDMARKS = 300, 290  # a campus of 300 frames has a few without ground truth
+CORRIDOR = "corridor halves"
 CAMPUS_SEASONS = ("winter", "summer", "autumn")
 CAMPUS_TOLERANCE_M = 3.5  # two of its frames
 
@@ -76,7 +77,7 @@ def corridor(data: Path) -> Iterator[Split]:
     for map_half, landmark_half in (("0:56", "56:111"), ("56:111", "0:56")):
         n_landmarks = 55 if landmark_half == "56:111" else 56
         options = ("--ground-truth", str(accepted))
-        yield Split("corridor halves", f"{ref}#{landmark_half}", f"{ref}#{map_half}", str(query), n_landmarks, options)
+        yield Split(CORRIDOR, f"{ref}#{landmark_half}", f"{ref}#{map_half}", str(query), n_landmarks, options)
 
 
 def campus(work: Path) -> Iterator[Split]:
@@ -140,11 +141,21 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         ratios.append([_mean(of_splits, extractor, "anr", "composed") / best for extractor in extractors])
     means = [f"{mean:.2f}" for mean in np.exp(np.log(ratios).mean(axis=0))]
     rows.append(["geometric mean of `composed` against the gradient grid", *means])
+    is_elsewhere = [group != CORRIDOR for group in grouped]
+    means = [f"{mean:.2f}" for mean in np.exp(np.log(np.array(ratios)[is_elsewhere]).mean(axis=0))]
+    rows.append([f"the same without {CORRIDOR}", *means])
     yield from markdown(("split", *extractors), rows)
+    yield ""
+    costs_more = zip(grouped, np.array(ratios)[:, 0] - 1, strict=True)
+    worse = [f"{group} (+{100 * cost:.0f} %)" for group, cost in costs_more if cost > 0]
+    yield (
+        f"What falls short: of {extractors[0]} a mean of at most 0.6 was asked for, and no split worse "
+        f"than the gradient grid's. Worse: {', '.join(worse) or 'none'}."
+    )
     yield ""
     costs = []
     for extractor in extractors:
-        of_splits = [document[extractor] for document in grouped["corridor halves"]]
+        of_splits = [document[extractor] for document in grouped[CORRIDOR]]
         took_ms = float(np.median([document["encode_ms"] for document in of_splits]))
         costs.append([extractor, of_splits[0]["encoding_dim"], of_splits[0]["bytes_per_encoding"], f"{took_ms:.1f}"])
     yield from markdown(("extractor", "numbers", "bytes a frame", "ms an image, read and encoded"), costs)

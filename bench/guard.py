@@ -321,6 +321,16 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     return markdown(("pairs", "encoder", "n", "old rule accepts, %", "accepts, %"), [*cells, everything])
 
 
+def shortfalls(rows: Sequence[Row]) -> Iterator[str]:
+    """Markdown items: the kinds of pairs that are judged wrongly more often than all kinds together show."""
+    parts = {REPORTED: "nothing was chosen on", CHOSEN_ON: "the numbers were chosen on"}
+    for row in rows:
+        share = row.n_new / PAIRS
+        if share < 0.95 if row.is_one_route else share > 0.01:
+            accepted = share_text(row.n_new, PAIRS)
+            yield f"- {row.kind}, {row.encoder}, places that {parts[row.part]}: accepts {accepted} %."
+
+
 def report(rows: Sequence[Row]) -> list[str]:
     """The whole document."""
     lines = [
@@ -350,7 +360,10 @@ def report(rows: Sequence[Row]) -> list[str]:
         for is_one_route, title in ((False, "Drives of two places"), (True, "Drives of one route, in two seasons")):
             part_rows = [row for row in rows if row.part == part and row.is_one_route is is_one_route]
             lines += ["", *([head, ""] if not is_one_route else []), f"{title}:", "", *table(part_rows)]
-    return lines
+    hidden = (
+        "What **all** hides: kinds of which more than 1 % of two places are accepted, or fewer than 95 % of one route."
+    )
+    return [*lines, "", "## What falls short", "", hidden, "", *shortfalls(rows)]
 
 
 def main() -> None:

@@ -229,6 +229,11 @@ def report() -> Iterator[str]:
     yield from ("", "Made by `python -m bench.landmarks`.", "", machine())
     yield from ("", "## Accuracy", "", "ANR / R@1, percent.", "")
     yield from accuracy(all_cases)
+    yield from (
+        "",
+        f"What falls short: accuracy is measured up to r = {_NUMBERS[-1]} and 600 places. How many landmarks a route "
+        f"of {_LENGTHS[-1]:,} images wants is not known, only how long it takes to choose them.",
+    )
     yield from ("", f"## Time to choose {_N_LANDMARKS}, made-up encodings of {composed.MOST_DIMENSIONS} numbers", "")
     yield from times()
     yield from ("", "## What was tried for lists", "")

