@@ -505,6 +505,8 @@ def test_a_number_that_stands_still_in_a_season_says_nothing(map_drives, still):
     job, place = map_drives(summer, winter, same_route=True)
     assert job["state"] == "succeeded", job["error"]
     assert job["result"]["metrics"]["second_season"]["accepted"] is True
+    expected = f"1 of {DIM} numbers of an encoding stand still in traverse {still} alone"
+    assert sum(expected in warning for warning in job["result"]["metrics"]["warnings"]) == (still != "both")
     for value in (-3, 0, 700):
         live[:, 3] = value
         assert [place(live[frame])["belief"]["mode_m"] for frame in (30, 80)] == [30, 80]
@@ -533,6 +535,7 @@ def test_a_drive_the_other_way_teaches_no_second_season(map_drives, plane):
     verdict = job["result"]["metrics"]["second_season"]
     says = "share 0 places" if plane else "agree no better than where one is shifted"
     assert (verdict["accepted"], says in verdict["why"]) == (False, True)
+    assert job["result"]["metrics"]["warnings"] == [f"it learnt nothing of a second season: {verdict['why']}"]
     assert place(season(3)[30])["belief"]["mode_m"] == 30
 
 

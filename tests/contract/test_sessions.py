@@ -242,8 +242,11 @@ def test_metres_may_be_given_a_price(client):
     assert bits[0] == bits[1]
     values = [action["q_value"] for action in dear_plan["actions"]]
     assert values == sorted(values, reverse=True)
-    constant = client.begin(planner="constant:3", price_bits_per_m=1.5)["next_best_view"]
+    constant = client.begin(planner="constant:3", price_bits_per_m=0.0)["next_best_view"]
     assert {(action["q_value"], action["expected_bits"]) for action in constant["actions"]} == {(None, None)}
+    for planner in ("constant:3", "nnql", "random"):
+        refused = client.post("/v1/domains/ready/sessions", json={"planner": planner, "price_bits_per_m": 1.5})
+        assert "leave one of the two out" in problem(refused, 422, "invalid_input")["detail"]
 
 
 def test_the_credible_set_is_the_smallest_one(client):

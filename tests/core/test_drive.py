@@ -243,3 +243,21 @@ def test_frames_unlike_all_others_are_told_by_name() -> None:
         "dark (40.png, 41.png, 42.png)"
     ]
     assert drive.at(np.arange(40)).picture_warnings("of the map") == []
+
+
+def test_two_drives_of_other_extractors_are_told() -> None:
+    """Encodings have a mean of their extractor's: their numbers in another order stand for those of another one."""
+    rng = np.random.default_rng(0)
+    mean, order = rng.normal(size=64), rng.permutation(64)
+    summer, winter = ((mean + rng.normal(size=(80, 64))).astype(np.float32) for _ in range(2))
+
+    def warnings(encodings: np.ndarray) -> list[str]:
+        drives = (
+            Drive(name=name, position_m=np.arange(80.0), encodings=e) for name, e in (("a", summer), ("b", encodings))
+        )
+        return next(drives).encoding_warnings(next(drives))
+
+    (warning,) = warnings(winter[:, order])
+    assert "the encodings of traverses a and b have little in common" in warning
+    assert warnings(winter) == []
+    assert warnings(rng.normal(size=(80, 64)).astype(np.float32)) == [], "without a mean nothing can be told"

@@ -347,6 +347,3 @@ def _show_job(job: Job, json_output: bool) -> None:
     if fused := metrics.get("fused"):
         outcome = "fused into the places seen again" if fused.get("accepted") else f"not fused: {fused.get('why')}"
         REMARKS.print(f"map {version}: the drive is {outcome}; {fused.get('n_new_images')} new images", soft_wrap=True)
-    season = job.second_season
-    if season.get("n_pairs") and not season.get("accepted"):  # their positions are comparable
-        REMARKS.print(f"map {version} learnt nothing of a second season: {season.get('why')}", soft_wrap=True)

@@ -371,9 +371,9 @@ class ClientCalls(Face, Generic[AnySession]):
         that is known. The `planner` chooses the next view (`informed`, `nnql`, `random`, `constant:3`, ...), `belief`
         is `particle` or `grid`, `update` says how a view changes it, `seed` all that is drawn at random. With mass of
         `confidence` within 5 m of the likeliest place the robot may stop; `price_bits_per_m` is what a metre costs
-        `informed`. What is absent is the service's default. With `keep` it outlives its `with` block. The
-        `idempotency_key` names this beginning, so that it can be repeated after a `TransportError`. Raises
-        UnknownDomainError, NoActiveMapError, InvalidPriorError, TooManySessionsError.
+        `informed`; other planners refuse it. What is absent is the service's default. With `keep` it outlives its
+        `with` block. The `idempotency_key` names this beginning, so that it can be repeated after a `TransportError`.
+        Raises UnknownDomainError, NoActiveMapError, InvalidPriorError, TooManySessionsError.
         """
         document = {
             "start_position_m": start_position_m,

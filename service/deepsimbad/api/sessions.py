@@ -59,10 +59,11 @@ from deepsimbad.api.requests import (
 )
 from deepsimbad.core.belief.particles import FilterKind
 from deepsimbad.core.belief.summary import DEFAULT_CONFIDENCE
+from deepsimbad.core.planners import INFORMED
 from deepsimbad.core.relevance import UpdateRule
 from deepsimbad.engine.session import DEFAULT_START_STD_M, Observation, SessionConfig, SessionView
 from deepsimbad.engine.worker import Stopwatch
-from deepsimbad.errors import DeepSimbadError
+from deepsimbad.errors import DeepSimbadError, InvalidInputError
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
 from deepsimbad.store.sessions import IdempotencyKey, ListedSession
 
@@ -100,7 +101,13 @@ class SessionBody(JsonBody):
     ] = None
 
     def config(self) -> SessionConfig:
-        """The configuration as the engine takes it."""
+        """The configuration as the engine takes it; raises InvalidInputError where the planner knows no price."""
+        if self.price_bits_per_m and self.planner not in {None, INFORMED}:
+            raise InvalidInputError(
+                f"price_bits_per_m is for the planner {INFORMED}, and {self.planner!a} knows no price of metres: leave "
+                "one of the two out",
+                field="price_bits_per_m",
+            )
         return SessionConfig(**{name: value for name, value in self if value is not None})
 
 

@@ -213,9 +213,6 @@ def map_(
     click.echo(f"map {result['map_version']} of {domain} is active: {size}")
     for warning in metrics["warnings"]:
         click.echo(f"warning: {warning}", err=True)
-    season = metrics["second_season"]
-    if season is not None and season["n_pairs"] and not season["accepted"]:  # their positions are comparable
-        click.echo(f"it learnt nothing of a second season: {season['why']}", err=True)
 
 
 def _images_by_digest(

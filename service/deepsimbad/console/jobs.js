@@ -92,8 +92,9 @@ function Headline({ metrics }) {
     ["ANR of its check", typeof check?.anr === "number" && html`${check.anr.toFixed(2)} <small>%, 0 is perfect</small>`],
     ["The map before", typeof check?.anr_active === "number" && html`${check.anr_active.toFixed(2)} <small>%</small>`],
   ].filter(([, figure]) => figure);
-  const season = metrics.second_season;
-  const remarks = [...(season && !season.accepted ? [`It learnt nothing of a second season: ${season.why}.`] : []), ...(metrics.warnings ?? [])];
+  const season = metrics.second_season, warnings = metrics.warnings ?? [];
+  const isTold = !season || season.accepted || warnings.some((warning) => warning.includes(season.why));
+  const remarks = [...(isTold ? [] : [`It learnt nothing of a second season: ${season.why}.`]), ...warnings];
   return html`<dl class="figures">${figures.map(([name, figure]) => html`<div><dt>${name}</dt><dd>${figure}</dd></div>`)}</dl>${remarks.map((remark) => html`<p class="notice so">${remark}</p>`)}`;
 }
 

@@ -38,6 +38,11 @@ FRAME_NAME = rf"[^\x00-\x1f\x7f-\x9f]{{1,{MAX_NAME_LENGTH}}}"
 SHOWS_NOTHING = "show nothing: one grey, noise or the dark"  # continues a sentence about pictures
 UNLIKE_ALL = "are so unlike all others that they may show nothing of the route: glare, or the dark"
 _ROWS_AT_ONCE, _NAMED = 1024, 3
+_STILL = 1e-6  # of the greatest range of any number: one of less stands still
+# The mean encodings of a drive's two halves correlate by 0.84 and more over d, those of two seasons by 0.8 and more,
+# of a railway and a corridor by 0.16 to 0.24, of two extractors by less (NetVLAD and `gradient_grid`)
+_LIKE_HALVES, _LIKE_DRIVES = 0.7, 0.3
+_LEAST_NUMBERS = 32  # d; fewer correlate by chance
 
 SIGNIFICANCE = 0.002  # chance of the agreement at shift 0, up to which it counts as real
 # Of scores at equal positions, on average; where scenery repeats, drives of two routes rarely reach it by chance
@@ -150,6 +155,31 @@ class Drive:
             if is_found.any()
         ]
 
+    def encoding_warnings(self, other: "Drive") -> list[str]:
+        """Sentences about another drive's encodings, of as many numbers, that may come from another extractor."""
+        own_range, other_range = _ranges(self.encodings), _ranges(other.encodings)
+        warnings = []
+        for name, own, others in ((self.name, own_range, other_range), (other.name, other_range, own_range)):
+            # One that hardly moves in the other drive either, as a rare feature of a network, may stand still by chance
+            if n_still := int(((own < _STILL * own.max()) & (others > np.median(others) / 2)).sum()):
+                warnings.append(
+                    f"{n_still} of {own.size} numbers of an encoding stand still in traverse {name} alone, and tell "
+                    "nothing: is its extractor another one?"
+                )
+        between = _correlation(*(drive.encodings.mean(axis=0, dtype=np.float64) for drive in (self, other)))
+        halves = [drive._likeness_of_halves() for drive in (self, other)]
+        if self.encoding_dim >= _LEAST_NUMBERS and min(halves) > _LIKE_HALVES and between < _LIKE_DRIVES:
+            warnings.append(
+                f"the encodings of traverses {self.name} and {other.name} have little in common (their means correlate "
+                f"by {between:.2f}, those of either's halves by {min(halves):.2f}): are they of one extractor, and of "
+                "places of one kind?"
+            )
+        return warnings
+
+    def _likeness_of_halves(self) -> float:
+        halves = np.array_split(self.encodings, 2)
+        return _correlation(*(half.mean(axis=0, dtype=np.float64) for half in halves)) if self.n_frames > 1 else 0.0
+
     def route(self, closed: bool = False) -> Route:
         """The frames' positions as a route; x, y only where some frame knows them.
 
@@ -229,6 +259,18 @@ class Drive:
                 raise InvalidEncodingError(f"the encoding of frame {frame} holds NaN or infinity")
 
 
+def _ranges(encodings: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[d] from the least to the greatest of every number of encodings [n, d]."""
+    return np.asarray(encodings.max(axis=0).astype(np.float64) - encodings.min(axis=0))
+
+
+def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Of two rows [d]; 0 where one of them is constant."""
+    first, second = first - first.mean(), second - second.mean()
+    lengths = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float(first @ second) / lengths if lengths > 0 else 0.0
+
+
 def _check_near(
     name: str, values_m: NDArray[np.float64], index: NDArray[np.int64], error: type[InvalidInputError]
 ) -> None:
@@ -285,6 +327,10 @@ class SecondSeason:
         return Query(rank_landmarks(self.dissimilarities[frames]), self.dissimilarities[frames], encodings)
 
 
+_OTHER_ROUTE = "the two drives are said not to share their positions"
+_UNKNOWN_ROUTE = "without x, y of both drives nothing says that their positions are comparable; say same_route"
+
+
 @dataclass(frozen=True)
 class SameRoute:
     """Whether a drive saw the mapped route, and how that was decided."""
@@ -301,6 +347,11 @@ class SameRoute:
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""
         return asdict(self)
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether the drives' positions are comparable, so that not to learn from them is news."""
+        return self.why not in {_UNKNOWN_ROUTE, _OTHER_ROUTE}
 
     def remarks(self) -> tuple[str, ...]:
         """Warnings about what the map learnt from the drive."""
@@ -328,10 +379,9 @@ def second_season(
     """
     route, other_route = map_drive.route(closed), other.route()
     if same_route is False:
-        return None, None, SameRoute(False, "the two drives are said not to share their positions", 0)
+        return None, None, SameRoute(False, _OTHER_ROUTE, 0)
     if same_route is None and (route.x_m is None or other_route.x_m is None):
-        reason = "without x, y of both drives nothing says that their positions are comparable; say same_route"
-        return None, None, SameRoute(False, reason, 0)
+        return None, None, SameRoute(False, _UNKNOWN_ROUTE, 0)
     if map_drive.dissimilarities is None or (other := measure(other)).dissimilarities is None:
         raise InvalidMapConfigError("dissimilarities are not measured")
     places = same_places(other_route, route)

@@ -185,7 +185,7 @@ class _Remap:
         return seal_version(self.catalog, self.domain, map_, record_config, metrics, progress.update, job_id)
 
     def _warnings(self, inputs: _Inputs) -> list[str]:
-        """Warnings of the drives' pictures: of drives that are not alike, or that show nothing."""
+        """Warnings of the drives' pictures and encodings: of drives that are not alike, or that show nothing."""
         training_camera, training_label = inputs.training.camera, f"those of traverse {self.config.training_traverse}"
         pairs: list[tuple[Drive | None, tuple[Camera | None, ...], str]]
         pairs = [
@@ -194,6 +194,10 @@ class _Remap:
         if inputs.base is not None:
             pairs.append((inputs.training, inputs.base.cameras, "those of the active map"))
         warnings: dict[str, None] = {}  # in order, each once
+        if not self.evaluator.forms:  # who encodes elsewhere may do so by two extractors
+            for other in (inputs.candidates, inputs.second):
+                if other is not None:
+                    warnings |= dict.fromkeys(inputs.training.encoding_warnings(other))
         for drive, cameras, label in pairs:
             if drive is not None and drive.camera is not None:
                 reason = drive.camera.unlike(filter(None, cameras), label)
@@ -309,16 +313,19 @@ class _Remap:
             **({} if base is None else base.landmark_origins()),
             q_values=q_values,
         )
-        same_route, second_season = map_build.same_route, None
+        same_route, second_season, warnings = map_build.same_route, None, list(map_build.warnings)
         if same_route is not None and inputs.second is not None:
             second_season = {**same_route.as_dict(), "traverse": inputs.second.name}
+            warnings += same_route.remarks()
+            if same_route.is_asked and not same_route.accepted:
+                warnings.append(f"it learnt nothing of a second season: {same_route.why}")
         results = {
             "landmarks": ACTIVE_MAP if base else LANDMARK_TRAVERSE if inputs.candidates else TRAINING,
             "training": learning,
             "second_season": second_season,
             "camera_of": config.camera_of if map_build.by_camera else None,
             **({} if map_build.fitting is None else {"fitting": dict(map_build.fitting)}),
-            "warnings": [*map_build.warnings, *(() if same_route is None else same_route.remarks())],
+            "warnings": warnings,
         }
         return map_, map_, config_document, results
 

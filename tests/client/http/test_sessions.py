@@ -55,7 +55,7 @@ def test_a_session_from_start_to_end(client, views):
 
 
 def test_what_travels(client, link, views):
-    wishes = {"planner": "nnql", "belief": "particle", "update": "log_likelihood"}
+    wishes = {"planner": "informed", "belief": "particle", "update": "log_likelihood"}
     wishes |= {"confidence": 0.5, "price_bits_per_m": 0.25}
     client.session("route", keep=True)
     with client.session("route", 12.5, 3, seed=0, **wishes) as session:
