@@ -157,21 +157,21 @@ class Drive:
 
     def encoding_warnings(self, other: "Drive") -> list[str]:
         """Sentences about another drive's encodings, of as many numbers, that may come from another extractor."""
-        own_range, other_range = _ranges(self.encodings), _ranges(other.encodings)
+        ranges, other_ranges = _ranges(self.encodings), _ranges(other.encodings)
         warnings = []
-        for name, own, others in ((self.name, own_range, other_range), (other.name, other_range, own_range)):
+        for name, range_, reference in ((self.name, ranges, other_ranges), (other.name, other_ranges, ranges)):
             # One that hardly moves in the other drive either, as a rare feature of a network, may stand still by chance
-            if n_still := int(((own < _STILL * own.max()) & (others > np.median(others) / 2)).sum()):
+            if n_still := int(((range_ < _STILL * range_.max()) & (reference > np.median(reference) / 2)).sum()):
                 warnings.append(
-                    f"{n_still} of {own.size} numbers of an encoding stand still in traverse {name} alone, and tell "
+                    f"{n_still} of {range_.size} numbers of an encoding stand still in traverse {name} alone, and tell "
                     "nothing: is its extractor another one?"
                 )
-        between = _correlation(*(drive.encodings.mean(axis=0, dtype=np.float64) for drive in (self, other)))
+        likeness = _correlation(*(drive.encodings.mean(axis=0, dtype=np.float64) for drive in (self, other)))
         halves = [drive._likeness_of_halves() for drive in (self, other)]
-        if self.encoding_dim >= _LEAST_NUMBERS and min(halves) > _LIKE_HALVES and between < _LIKE_DRIVES:
+        if self.encoding_dim >= _LEAST_NUMBERS and min(halves) > _LIKE_HALVES and likeness < _LIKE_DRIVES:
             warnings.append(
                 f"the encodings of traverses {self.name} and {other.name} have little in common (their means correlate "
-                f"by {between:.2f}, those of either's halves by {min(halves):.2f}): are they of one extractor, and of "
+                f"by {likeness:.2f}, those of either's halves by {min(halves):.2f}): are they of one extractor, and of "
                 "places of one kind?"
             )
         return warnings
