@@ -34,7 +34,7 @@ from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.evaluators.space import unit_vectors
 from deepsimbad.jobs.build import build, measure_drive, views_of
 
-N_LANDMARKS, N_SENT = (128, 256, 300, 500), (8, 16, 32, 48)  # and as many as the budget holds
+N_LANDMARKS, N_SENT = (128, 256, 300, 500), (8, 16, 32, 48, 64)  # and as many as the budget holds
 N_BITS = (3, 4, 5, 8)  # a number of a unit encoding
 LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
 _DRIVES = ("nr", "nq", "nq2")
