@@ -17,7 +17,7 @@ def print_whole(table: Table, console: Console) -> None:
         return
     width = Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = max(PIPE_COLUMNS, width)
+        console.width = PIPE_COLUMNS
     console.print(table if width <= console.width or not table.show_header else _cell_lines(table))
 
 

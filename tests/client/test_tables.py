@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from deepsimbad_client.tables import print_whole
+from deepsimbad_client.tables import PIPE_COLUMNS, print_whole
 
 NAMES = ("job", "state", "outcome")
 ROWS = (("0123456789abcdef" * 2, "succeeded", "map 1, sealed"), ("f" * 32, "failed", "too few candidates"))
@@ -27,6 +27,15 @@ def test_nothing_is_cut(monkeypatch, columns, is_terminal):
     is_down = is_terminal and columns < 140
     assert ("│" in printed) == (not is_down)
     assert not is_terminal or max(map(len, printed.splitlines())) <= columns
+
+
+def test_a_pipe_gets_no_lines_without_end(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    table, stream = Table(*"abcdefgh"), io.StringIO()
+    table.add_row(*(8 * ["x" * 30]))
+    print_whole(table, Console(file=stream))
+    assert stream.getvalue().count("x" * 30) == 8
+    assert max(map(len, stream.getvalue().splitlines())) <= PIPE_COLUMNS
 
 
 def test_an_empty_table_says_so():

@@ -232,6 +232,12 @@ def test_a_robot_that_was_carried_is_lost_and_found(client, belief):
     assert carried[-1]["belief"]["off_route"] < 0.5
 
 
+def test_nan_is_named_as_no_finite_number(client):
+    body = b'{"confidence": NaN}'
+    answer = client.post("/v1/domains/ready/sessions", content=body, headers={"Content-Type": "application/json"})
+    assert "confidence: Input should be a finite number" in problem(answer, 422, "invalid_request")["detail"]
+
+
 def test_metres_may_be_given_a_price(client):
     free_plan, dear_plan = (
         see(client, client.session(price_bits_per_m=price), 11)["next_best_view"] for price in (0, 100)

@@ -5,10 +5,12 @@ import stat
 import zipfile
 
 import pytest
+import torch
 
 from deepsimbad.errors import InvalidWeightsError, MissingWeightsError
 from deepsimbad.evaluators.extractors import netvlad, squeezenet
 from deepsimbad.evaluators.extractors.efficientnet_lite0 import EfficientNetLite0
+from deepsimbad.evaluators.nets.netvlad import NetVlad
 from deepsimbad.evaluators.registry import EXTRACTOR_PATTERN
 from deepsimbad.evaluators.weights import downloads
 from deepsimbad.evaluators.weights.downloads import pull_file, unpack
@@ -16,7 +18,7 @@ from deepsimbad.evaluators.weights.files import file_sha256
 from deepsimbad.evaluators.weights.library import HUB, KNOWN, canonical, known_weights
 from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
 
-from .references import random_network, write_matlab
+from .references import FULL, random_network, write_matlab
 
 
 def test_every_row_can_be_named_in_a_configuration():
@@ -58,6 +60,19 @@ def test_what_is_stated_of_our_own_extractors_is_so():
         ("openibl", netvlad.OPENIBL),
     ):
         assert known_weights(name).input_size == preset.input_size, name
+
+
+@pytest.mark.parametrize(
+    ("name", "n_clusters"), [("openibl", 64), *((f"patch-netvlad-mapillary-{d}", 16) for d in (128, 512, 4096))]
+)
+def test_files_of_netvlad_are_as_large_as_their_numbers(name, n_clusters):
+    """In single precision, but for Patch-NetVLAD's whitening in double."""
+    weights = known_weights(name)
+    with torch.device("meta"):
+        network = NetVlad(FULL, n_clusters, weights.encoding_dim, cluster_major=True)
+    n_whitening = sum(tensor.numel() for tensor in network.whitening.parameters())
+    n_numbers = sum(tensor.numel() for tensor in network.parameters()) + n_whitening * (name != "openibl")
+    assert weights.size_mb == pytest.approx(4e-6 * n_numbers, abs=1)
 
 
 def test_a_tree_is_its_paths_and_contents(tmp_path):

@@ -324,6 +324,13 @@ def test_a_tree_that_was_changed_is_not_run(tmp_path, change):
     assert load(tmp_path).encoding_dim == 8
 
 
+def test_another_entry_of_a_repository_that_is_here_needs_no_archive(tmp_path):
+    first = pull(tmp_path)
+    wish = HubWish(f"torchhub:{REPOSITORY}:wrapped", commit=COMMIT, input_size=SIZE)
+    second = pull_hub(tmp_path, wish, lambda *_: None)
+    assert (second.tree_sha256, second.archive_sha256) == (first.tree_sha256, first.archive_sha256)
+
+
 def test_an_archive_of_the_same_commit_must_be_the_same(tmp_path):
     record = pull(tmp_path)
     (tmp_path / "hub" / record.folder / "hubconf.py").write_text("")

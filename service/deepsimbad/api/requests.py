@@ -5,6 +5,7 @@ deeply nested JSON with 400, and takes NaN.
 """
 
 import hashlib
+import math
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -388,7 +389,9 @@ Body = TypeVar("Body", bound=JsonBody)
 
 
 def _with_nearest(finding: ErrorDetails, kind: type[Body]) -> ErrorDetails:
-    """A finding of pydantic, whose message names what is nearest to an unknown member of a body, or to a choice."""
+    """A finding of pydantic, in better words: of NaN, and with what is nearest to an unknown member or choice."""
+    if isinstance(finding["input"], float) and math.isnan(finding["input"]):  # no number is less or greater
+        return {**finding, "msg": "Input should be a finite number", "type": "finite_number"}
     if finding["type"] == "extra_forbidden" and len(finding["loc"]) == 1:
         return {**finding, "msg": f"there is no such member{nearest_of(str(finding['loc'][0]), kind.model_fields)}"}
     choices = re.findall(r"'([^']*)'", str(finding.get("ctx", {}).get("expected", "")))

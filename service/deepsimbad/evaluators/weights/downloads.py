@@ -124,8 +124,9 @@ def pull_hub(folder: Path, wish: HubWish, tell: Tell) -> HubRecord:
         commit = resolve_commit(repository, f"say which one you want with --commit; see {archive_url(repository, '')}")
     hub = folder.absolute() / HUB_FOLDER
     tree, archive = hub / hub_tree(repository, commit), hub / f"{hub_tree(repository, commit)}.zip"
-    if old_record is not None and old_record.commit == commit and found_sha256(tree) == old_record.tree_sha256:
-        archive_sha256 = old_record.archive_sha256
+    unpacked = next((record for record in lock.hub.values() if record.folder == tree.name), None)
+    if unpacked is not None and found_sha256(tree) == unpacked.tree_sha256:  # perhaps for another of its entries
+        archive_sha256 = unpacked.archive_sha256
     else:
         if not archive.is_file():
             fetch(archive_url(repository, commit), archive, tell, wish.sha256)

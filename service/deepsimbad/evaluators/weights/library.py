@@ -29,7 +29,7 @@ class KnownWeights:
     url: str | None = None  # of the file; None: it cannot be fetched by a plain download, or is a repository's
     page: str | None = None  # where a person gets it
     sha256: str | None = None  # of the file, in hex, or as many of its first digits as are known
-    size_mb: int | None = None  # in millions of bytes, all that is downloaded together, roughly
+    size_mb: int | None = None  # in millions of bytes, all that is downloaded together, roughly; None: not known
     commit: str | None = None  # of the repository
     arguments: Mapping[str, Argument] = field(default_factory=lambda: _NO_ARGUMENTS)  # what its entry is given
     packages: tuple[str, ...] = ()  # what it needs beside the service's own packages, as pip names them
@@ -75,12 +75,12 @@ KNOWN: tuple[KnownWeights, ...] = (
         "pytorch-netvlad", "netvlad:checkpoint.pth.tar", 32768, (640, 480), None,
         page="https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
     ),
-    *(_patch_netvlad("mapillary", "mapillary", dim, size) for dim, size in ((128, None), (512, 92), (4096, None))),
+    *(_patch_netvlad("mapillary", "mapillary", dim, size) for dim, size in ((128, 67), (512, 92), (4096, 327))),
     *(_patch_netvlad("pittsburgh", "pitts", dim) for dim in (128, 512, 4096)),
     KnownWeights(
         "openibl", "netvlad:vgg16_netvlad.pth", 4096, (640, 480), "MIT",
         url="https://github.com/yxgeee/OpenIBL/releases/download/v0.1.0-beta/vgg16_netvlad.pth",
-        page="https://github.com/yxgeee/OpenIBL",
+        page="https://github.com/yxgeee/OpenIBL", size_mb=596,
     ),
     KnownWeights(
         "megaloc", f"{HUB}gmberton/MegaLoc:get_trained_model", 8448, (322, 322), "MIT",
