@@ -46,12 +46,10 @@ SECURITY_HEADERS = {
     b"cross-origin-resource-policy": b"same-origin",
 }
 # Codes of answers that turn a request away for its kind or its number, before its content is looked at.
-REFUSALS = frozenset(
-    {
-        *("unauthorized", "forbidden", "foreign_host", "rate_limited", "overloaded"),
-        *("too_many_sessions", "too_many_jobs", "too_many_domains", "body_too_large", "image_too_large"),
-    }
-)
+REFUSALS = {
+    *("unauthorized", "forbidden", "foreign_host", "rate_limited", "overloaded"),
+    *("too_many_sessions", "too_many_jobs", "too_many_domains", "body_too_large", "image_too_large"),
+}
 _CORS_REQUEST_HEADERS = (
     *("Authorization", "X-API-Key", "Content-Type", "X-Request-ID", "Idempotency-Key"),
     *("Range", "If-Range", "If-None-Match"),
@@ -257,8 +255,10 @@ class _Request:
         route = getattr(scope.get("route"), "path", UNROUTED)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
         metrics.end_request(method, route, self.status, seconds)
-        state = scope["state"] | (scope.get("path_params") or {})
-        log_fields = {name: state[name] for name in _LOG_FIELDS if name in state}
+        state, log_fields = scope["state"] | (scope.get("path_params") or {}), {}
+        for name in _LOG_FIELDS:
+            if name in state:
+                log_fields[name] = state[name]
         if log_fields.get("code") in REFUSALS:
             metrics.count_refusal(log_fields.get("limit", log_fields["code"]))
         if log.isEnabledFor(logging.INFO):

@@ -164,10 +164,10 @@ class OpenFile:
         self._lock = threading.RLock()
         self._reader = reader or db
         self._reader_lock = threading.RLock() if reader else self._lock
-        self._inode = path.stat().st_ino
-        self._log = path.with_name(f"{path.name}-wal")
+        self._inodes = {path: path.stat().st_ino}
         # SQLite removes its log only when the last connection closes, and this one is open.
-        self._log_inode = _inode(self._log)
+        if (log := path.with_name(f"{path.name}-wal")).exists():
+            self._inodes[log] = log.stat().st_ino
 
     def close(self) -> None:
         """Close the file; where readers have their own connection its log, empty, stays.
@@ -209,30 +209,21 @@ class OpenFile:
         self.check_is_there()
 
     def check_is_there(self) -> None:
-        """Raise an error where the file or its log is gone or replaced, which whoever has it open would not notice.
+        """Raise `_removal_error` where the file or its log is gone or another: whoever has them open would not notice.
 
-        `_removal_error` for the file; DamagedFileError for the log, without which a crash would lose commits.
+        Without the log a crash would lose commits.
         """
         with storage_faults(self._path):
-            if _inode(self._path) != self._inode:
-                raise self._removal_error()
-            if _inode(self._log) != self._log_inode:
-                raise _removed_file(self._log)
+            for path, inode in self._inodes.items():
+                try:
+                    is_there = path.stat().st_ino == inode
+                except FileNotFoundError:
+                    is_there = False
+                if not is_there:
+                    raise self._removal_error(path)
 
-    def _removal_error(self) -> DeepSimbadError:
-        return _removed_file(self._path)
-
-
-def _inode(path: Path) -> int | None:
-    """The inode of a file; None where there is none."""
-    try:
-        return path.stat().st_ino
-    except FileNotFoundError:
-        return None
-
-
-def _removed_file(path: Path) -> DamagedFileError:
-    return DamagedFileError(f"{path.name} was removed under the running service", file=path.name)
+    def _removal_error(self, path: Path) -> DeepSimbadError:
+        return DamagedFileError(f"{path.name} was removed under the running service", file=path.name)
 
 
 class GroupCommit:

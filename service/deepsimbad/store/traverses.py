@@ -156,8 +156,10 @@ class Traverse(Spool):
                 raise _unknown(data_dir, domain, name)
             return _main_camera(data_dir, domain, name, file_state(path))
 
-    def _removal_error(self) -> UnknownTraverseError:
-        return UnknownTraverseError(f"traverse {self.name} was deleted")
+    def _removal_error(self, path: Path) -> DeepSimbadError:
+        if path == self._path:
+            return UnknownTraverseError(f"traverse {self.name} was deleted")
+        return super()._removal_error(path)
 
     def put_frames(
         self, frames: Drive, replace: bool = True, pictures: Mapping[int, bytes] = MappingProxyType({})
