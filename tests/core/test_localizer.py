@@ -104,7 +104,7 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
         )
         np.testing.assert_allclose(step.state.relevance, relevance_of_images)
         np.testing.assert_allclose(step.state.belief.mass, belief.mass)
-        assert step.state.belief.off_route == pytest.approx(belief.off_route)
+        assert step.state.belief.doubt.off_route == pytest.approx(belief.doubt.off_route)
         ahead = information_ahead(map_, 0.1)
         if ahead is None:
             assert (step.plan.action_m, step.plan.values) == (5.0, None)

@@ -27,7 +27,7 @@ class Relevance(StrEnum):
     SIMBAD = "simbad"
     BRUTE_FORCE = "brute_force"
 
-    @property
+    @cached_property
     def traits(self) -> "RelevanceTraits":
         """What it compares, and what maps for it hold."""
         return _TRAITS[self]

@@ -143,7 +143,7 @@ class Route:
         """The map images from which a move ends on the route, as `reaches` has it."""
         if self.closed:
             return slice(0, self.n_images)
-        ends_m = self.start_m - _ROUNDING_M, self.position_m[-1] + _ROUNDING_M
+        ends_m = self.position_m[0] - _ROUNDING_M, self.position_m[-1] + _ROUNDING_M
         first = int(np.searchsorted(self.position_m, ends_m[0] - action_m))
         return slice(first, max(first, int(np.searchsorted(self.position_m, ends_m[1] - action_m, side="right"))))
 

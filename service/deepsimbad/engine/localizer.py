@@ -131,7 +131,7 @@ def localize(
     ids = shortlist(step.relevance, length)
     watch.lap("shortlist")
     belief = step.state.belief
-    summary = summarise(snapshot.route, belief.mass, length, belief.off_route)
+    summary = summarise(snapshot.route, belief.mass, length, belief.doubt.off_route)
     watch.lap("belief")
     plan = None
     if snapshot.view_bits is not None or snapshot.q_values is not None:

@@ -267,7 +267,7 @@ def view_of(
     """Summarise a state, with lists of the default length where `n_shortlist` is None; milliseconds of work."""
     snapshot, belief, step = state.engine.snapshot, state.belief, state.step
     length = shortlist_length(snapshot, n_shortlist)
-    summary = summarise(snapshot.route, belief.belief.mass, length, belief.belief.off_route)
+    summary = summarise(snapshot.route, belief.belief.mass, length, belief.belief.doubt.off_route)
     return SessionView(
         session_id=session.record.session_id,
         expires_at=expires_at,

@@ -45,7 +45,7 @@ def test_a_view_that_answers_every_place_alike_changes_nothing(kind, rule, route
     start = FILTERS[kind].uniform(route, rule=rule)
     belief = start.updated(evidence_of(np.full(100, 0.7), rule), step=0)
     np.testing.assert_allclose(belief.mass, start.mass, atol=1e-3)
-    assert belief.off_route == pytest.approx(0.02)
+    assert belief.doubt.off_route == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("rule", list(UpdateRule))
@@ -73,7 +73,7 @@ def test_relevances_of_any_size_leave_a_belief(kind, rule, route):
         belief = belief.updated(evidence_of(-1e6 * np.arange(100.0), rule), step)
     assert belief.mass.sum() == pytest.approx(1)
     assert belief.mass.argmax() == 0
-    assert 0 <= belief.off_route <= 1
+    assert 0 <= belief.doubt.off_route <= 1
 
 
 def test_a_view_that_excludes_all_that_is_believed_changes_nothing(route):
@@ -94,7 +94,7 @@ def test_a_belief_at_a_wrong_place_goes_on_however_surely_views_exclude_it(kind,
         belief = belief.updated(evidence_of(relevance, UpdateRule.LOG_LIKELIHOOD), step)
         belief = belief.predicted(1.0, 0.1, step + 1)
         assert belief.mass.sum() == pytest.approx(1)
-    assert belief.off_route == pytest.approx(1)
+    assert belief.doubt.off_route == pytest.approx(1)
 
 
 def error_matrix(n, action, std, closed=False, slipping=1.0):
@@ -159,7 +159,7 @@ def test_a_mixture_is_three_trusts_weighed_by_what_they_predicted(shared):
         belief = belief.updated(evidence_of(view, shared=shared if step else 0.0), step)
     mass, lost = slow_mixture(route, views, moves, shared)
     np.testing.assert_allclose(belief.mass, mass, rtol=1e-3, atol=1e-6)
-    assert belief.off_route == pytest.approx(lost, rel=1e-3)
+    assert belief.doubt.off_route == pytest.approx(lost, rel=1e-3)
 
 
 def test_views_that_lie_are_trusted_less(route):
@@ -248,7 +248,7 @@ def test_a_move_equals_its_definition(closed, action, std):
     slipping = min(1.0, std / np.sqrt(0.05**2 + 0.01 * abs(action)))  # odometry more exact than usual slips less
     spread = target_mass @ error_matrix(n, action / cells.step_m, std / cells.step_m, closed, slipping)
     lost = past_mass * 0.98 + (1 - np.exp(-0.0005 * abs(action))) * (1 - past_mass)
-    assert belief.off_route == pytest.approx(lost, rel=1e-6, abs=1e-12)
+    assert belief.doubt.off_route == pytest.approx(lost, rel=1e-6, abs=1e-12)
     expected = spread * np.exp(-0.0005 * abs(action)) + 0.02 * past_mass / n
     np.testing.assert_allclose(belief.masses[0] / belief.masses[0].sum(), expected / expected.sum(), atol=1e-6)
     assert belief.mass.sum() == pytest.approx(1)
@@ -256,10 +256,10 @@ def test_a_move_equals_its_definition(closed, action, std):
 
 def test_what_leads_past_the_end_is_lost(route):
     belief = holding(route, np.ones(100)).predicted(20.0, 1e-9, step=1)
-    assert belief.off_route == pytest.approx(0.2 * 0.98 + 0.8 * (1 - np.exp(-0.01)))
+    assert belief.doubt.off_route == pytest.approx(0.2 * 0.98 + 0.8 * (1 - np.exp(-0.01)))
     assert belief.mass[20:].sum() > 0.97
     doubtful_belief = holding(route, np.eye(100)[95], lost=0.2).predicted(20.0, 0.3, step=1)
-    assert doubtful_belief.off_route > 0.8, "a robot that may be lost is refused no move"
+    assert doubtful_belief.doubt.off_route > 0.8, "a robot that may be lost is refused no move"
 
 
 @pytest.mark.parametrize("std", [1.0, 5.0])
@@ -316,7 +316,7 @@ def test_a_prior_narrower_than_the_spacing_keeps_its_nearest_image(route):
 @pytest.mark.parametrize("rule", sorted(set(UpdateRule) - {UpdateRule.MIXTURE}))
 def test_to_the_papers_updates_a_move_past_the_end_is_impossible_and_nobody_is_lost(kind, rule, route):
     belief = FILTERS[kind].uniform(route, rule=rule).predicted(20.0, 1e-6, step=1)
-    assert belief.off_route == pytest.approx(0.02)
+    assert belief.doubt.off_route == pytest.approx(0.02)
     assert belief.mass[:20].sum() == pytest.approx(0, abs=1e-9)
     assert belief.mass[20:].sum() == pytest.approx(1)
     with pytest.raises(PastTheEndError):
@@ -345,8 +345,8 @@ def test_a_robot_that_has_moved_may_always_have_been_carried(kind, route):
     for step, image in enumerate((80, 85, 90, 95)):
         belief = belief.predicted(5.0, 0.2, step) if step else belief
         belief = belief.updated(evidence_of(9.0 * (np.arange(100) == image)), step)
-    assert belief.off_route < 0.01
-    assert belief.predicted(20.0, 0.3, 4).off_route > 0.9
+    assert belief.doubt.off_route < 0.01
+    assert belief.predicted(20.0, 0.3, 4).doubt.off_route > 0.9
 
 
 # --- lost ----------------------------------------------------------------------------------------------------------
@@ -373,7 +373,7 @@ def test_a_robot_that_was_carried_is_found_again(kind, route):
         belief = belief.updated(evidence_of(view), step)
         if 5 <= step <= 13:
             is_found.append(abs(int(belief.mass.argmax()) - image) <= 2)
-            doubt = max(doubt, belief.off_route)
+            doubt = max(doubt, belief.doubt.off_route)
     assert doubt > (0.2 if kind is FilterKind.GRID else 0.1)
     assert sum(is_found[:6]) >= 3
     assert all(is_found[4:])
@@ -389,7 +389,7 @@ def test_a_robot_off_the_route_is_called_lost_and_one_on_it_is_not(route):
         noise[0, 10 + 5 * step] += 4
         noise[1, rng.integers(100)] += 4  # what it sees there looks like anything
         on, off = on.updated(evidence_of(noise[0]), step), off.updated(evidence_of(noise[1]), step)
-        doubts.append((on.off_route, off.off_route))
+        doubts.append((on.doubt.off_route, off.doubt.off_route))
     of_on, of_off = np.array(doubts).max(axis=0)
     assert of_on < 0.02
     assert of_off > 0.05
@@ -430,7 +430,7 @@ def test_particles_come_near_the_exact_filter_as_they_grow(rule, closed):
         differences.append(np.abs(exact.mass - sampled.mass).sum() / 2)
     assert differences[1] < 0.04
     assert differences[1] < differences[0] / 3
-    assert sampled.off_route == pytest.approx(exact.off_route, abs=0.01)
+    assert sampled.doubt.off_route == pytest.approx(exact.doubt.off_route, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", list(FilterKind))
@@ -497,7 +497,7 @@ def test_no_place_has_less_than_nothing():
 def test_particles_past_the_end_of_an_open_route_die():
     belief = ParticleFilter.uniform(Route(np.arange(101.0)), 1000, seed=0).predicted(40.0, 0.0, 1)
     assert belief.position_m.min() > 25  # a tenth of the move is its error
-    assert belief.off_route > 0.3
+    assert belief.doubt.off_route > 0.3
     assert belief.mass.sum() == pytest.approx(1)
 
 

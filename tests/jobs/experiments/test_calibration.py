@@ -119,7 +119,7 @@ def test_robots_look_where_they_are_and_report_their_moves(report, drives, evalu
             assert sight.set_m[start, view] == pytest.approx(map_.route.cell_m[smallest_set(mass)].sum())
             assert sight.is_covered[start, view] == smallest_set(mass)[start + step_m * view]
             assert sight.is_near[start, view] == (abs(int(mass.argmax()) - start - step_m * view) <= 5)
-            assert sight.off_route[start, view] == pytest.approx(state.belief.off_route)
+            assert sight.off_route[start, view] == pytest.approx(state.belief.doubt.off_route)
 
 
 def test_how_many_robots_and_views_there_are(report):

@@ -28,7 +28,7 @@ class Notebook:
         views = (*state.views, query)
         mass = np.ones(5) / 5 if self.believe is None else self.believe(views)
         route = Route(self.apart_m * np.arange(5))
-        belief = SimpleNamespace(mass=mass, route=route, off_route=0.0)
+        belief = SimpleNamespace(mass=mass, route=route, doubt=SimpleNamespace(off_route=0.0))
         new_state = SimpleNamespace(n_observations=state.n_observations + 1, views=views, belief=belief)
         return SimpleNamespace(state=new_state, plan=Plan("p", 1.0 + len(views)))
 

@@ -90,11 +90,6 @@ class GridFilter:
             return on_places
         return np.asarray(on_places[places.of_image] / places.n_images[places.of_image])
 
-    @property
-    def off_route(self) -> float:
-        """Probability that the robot is lost: off the route, or anywhere on it after having been carried."""
-        return self.doubt.off_route
-
     def predicted(self, action_m: float, action_std_m: float, step: int) -> "GridFilter":  # noqa: ARG002 - nothing is random
         """The belief after a move.
 

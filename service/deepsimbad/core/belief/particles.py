@@ -104,11 +104,6 @@ class ParticleFilter:
         mass = mass + (self.doubt.trust @ self.found_mass) * route.cell_m / route.cell_m.sum()
         return np.asarray(mass / max(mass.sum(), _NOTHING), np.float64)
 
-    @property
-    def off_route(self) -> float:
-        """See `GridFilter.off_route`."""
-        return self.doubt.off_route
-
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
         """See `GridFilter.predicted`; a particle that would be past the end of an open route dies.
 
