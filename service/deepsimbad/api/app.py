@@ -71,9 +71,21 @@ _WRITE_TIMEOUT_S = 2.0
 _LOADING_S = 1.0  # that a start spends on maps; what is left is loaded when it is asked for
 _FOLLOW_S = 1.0  # between two looks into a map store's log, of one small request each
 _ROUTERS = (  # routes are tried in this order: those that robots ask come first
-    *(sessions.router, localizations.router, router, domains.router, domains.admin),
-    *(traverses.router, frames.router, jobs.making, jobs.router, maps.router, sessions.listing),
-    *(whereabouts.router, events.router, coverage.router, pages.router),
+    sessions.router,
+    localizations.router,
+    router,
+    domains.router,
+    domains.admin,
+    traverses.router,
+    frames.router,
+    jobs.making,
+    jobs.router,
+    maps.router,
+    sessions.listing,
+    whereabouts.router,
+    events.router,
+    coverage.router,
+    pages.router,
 )
 _DESCRIPTION = (
     "Where on a prelearned route a robot is, from what it sees; every error is an RFC 9457 problem document. "

@@ -189,7 +189,10 @@ def map_(
             for role, recording in recordings.items():
                 progress.stage(f"read {role}")
                 encoded_recording = encode_recording(
-                    *(recording, measure, settings.max_pixels, progress.update),
+                    recording,
+                    measure,
+                    settings.max_pixels,
+                    progress.update,
                     allow_missing=allow_missing,
                     blocks=encode(recording, measure, progress.update),
                 )

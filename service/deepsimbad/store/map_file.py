@@ -39,8 +39,17 @@ from deepsimbad_migrations.map.migrations import migrations
 
 _AS_JSON = frozenset({"config", "evaluator", "actions_m", "metrics"})  # columns of `map`
 _DESCRIPTION = (  # the columns of `map` in the order of the checksum
-    *("domain", "version", "created_at", "config", "evaluator", "closed", "actions_m", "metrics"),
-    *("n_map_images", "n_landmarks", "list_length"),
+    "domain",
+    "version",
+    "created_at",
+    "config",
+    "evaluator",
+    "closed",
+    "actions_m",
+    "metrics",
+    "n_map_images",
+    "n_landmarks",
+    "list_length",
 )
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
 _PAGE_SIZES = (65536, 32768, 16384, 8192, 4096, 2048, 1024, 512)

@@ -193,8 +193,12 @@ class SharedCatalog(Catalog):
             ON CONFLICT (name) DO UPDATE SET created_at = excluded.created_at, options = excluded.options, shared = 1
             """,
             [
-                *(name, to_json(state["evaluator"]), int(state["closed"]), to_json(state["actions_m"])),
-                *(state["created_at"], to_json(state["options"])),
+                name,
+                to_json(state["evaluator"]),
+                int(state["closed"]),
+                to_json(state["actions_m"]),
+                state["created_at"],
+                to_json(state["options"]),
             ],
         )
         layout.traverses_folder(self.data_dir, name).mkdir(parents=True, exist_ok=True)

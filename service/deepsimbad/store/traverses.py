@@ -211,7 +211,12 @@ class Traverse(Spool):
                         grey_levels=levels,
                     )
             columns = (
-                *(frames.index, frames.position_m, frames.timestamp_us, frames.x_m, frames.y_m, frames.frame_name),
+                frames.index,
+                frames.position_m,
+                frames.timestamp_us,
+                frames.x_m,
+                frames.y_m,
+                frames.frame_name,
                 frames.content_digest.view(np.int64),  # SQLite's integers have a sign
                 frames.shows_nothing.astype(np.int64),
             )
