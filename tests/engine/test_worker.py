@@ -139,6 +139,13 @@ def test_an_image_waits_for_company_no_longer_than_it_may() -> None:
         worker.close()
 
 
+def test_an_image_that_waits_for_company_is_encoded_when_the_worker_is_closed() -> None:
+    worker, eyes = InferenceWorker(longest_wait_s=3600), Eyes(largest_batch=64)
+    answer = worker.encode(eyes, grey(7))
+    worker.close()
+    assert answer.result(0).values[0] == 7
+
+
 def test_an_evaluator_that_gives_too_few_encodings_fails_its_views_and_no_others(worker: InferenceWorker) -> None:
     eyes, gate = Eyes(largest_batch=3), block_encoding(worker)
     eyes.encode = lambda images: np.zeros((len(images) - 1, 1), np.float32)

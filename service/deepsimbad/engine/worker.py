@@ -228,7 +228,7 @@ class _EncodingLine(_Line):
                 next_work = self._queue.get(timeout=left_s) if left_s > 0 else self._queue.get_nowait()
             except Empty:
                 break
-            if next_work.task.evaluator is not evaluator:
+            if next_work.priority is Priority._CLOSE or next_work.task.evaluator is not evaluator:
                 self._queue.put(next_work)  # in its old place: the order is by priority and arrival
                 break
             batch.append(next_work)
