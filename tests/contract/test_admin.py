@@ -233,7 +233,8 @@ def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
         (warning,) = client.post(path, **lying_view).json()["warnings"]
         assert warning.startswith("the view's pixels are not like the map's: they lie on their side")
     job_of_both = client.remap("cameras", training_traverse="upright", landmark_traverse="lying", n_landmarks=8)
-    (warning,) = job_of_both["result"]["metrics"]["warnings"]
+    season_warning, warning = job_of_both["result"]["metrics"]["warnings"]
+    assert season_warning.startswith("it learnt nothing of a second season: the two drives share 8 places")
     assert warning.startswith(
         "the pictures of traverse lying are not like those of traverse upright: they lie on their"
     )

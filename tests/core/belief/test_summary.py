@@ -56,7 +56,7 @@ def test_of_a_map_of_one_image():
     route = Route(np.array([5.0]))
     evidence = ViewEvidence.of(np.array([1.0], np.float32), UpdateRule.LOG_LIKELIHOOD, 1.0)
     belief = GridFilter.uniform(route, UpdateRule.LOG_LIKELIHOOD).updated(evidence, step=0)
-    summary = summarise(route, belief.mass, 10, belief.off_route)
+    summary = summarise(route, belief.mass, 10, belief.doubt.off_route)
     assert (summary.mean_m, summary.mode_m, summary.std_m, summary.entropy_bits) == (5, 5, 0, 0)
     assert summary.credible_95_m == (5.0, 5.0)
     assert summary.histogram_mass.tolist() == [1.0]
