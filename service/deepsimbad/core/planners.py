@@ -85,7 +85,8 @@ def plan_by_information(view: PlanningView) -> Plan:
     moves = sorted(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True), reverse=True)
     best_m, best_chance = 0.0, -1.0
     for *_, action_m in moves:
-        chance = float(view.mass[view.map.route.staying(action_m)].sum())
+        stays = view.map.route.staying(action_m)
+        chance = 1 - float(view.mass[: stays.start].sum() + view.mass[stays.stop :].sum())  # of few images mostly
         if chance > best_chance:
             best_m, best_chance = action_m, chance
         if best_chance >= PROBABLY:
