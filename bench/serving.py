@@ -92,8 +92,3 @@ def restart_table() -> Iterator[str]:
             server.start()
             seconds.append(time.perf_counter() - start_s)
     yield f"From the start of the process to `/readyz` answering 200: {Timing(seconds)}."
-    yield ""
-    yield (
-        "`make demo` from a clean clone and an empty home: 211 s, two cores, 2026-11-30, timed by hand; asked for were "
-        "240."
-    )
