@@ -112,7 +112,7 @@ _TRAITS = {
         compares_unit_vectors=True,
         compares_encodings=True,
         compares_dissimilarities=True,
-        likelihood_scale=12.0,
+        likelihood_scale=8.0,  # docs/decisions/0039-one-season-counts-less.md
     ),
     Relevance.STANDARDISED: RelevanceTraits(UpdateRule.MIXTURE, ("statistics",)),
     Relevance.RRF: RelevanceTraits(UpdateRule.ADDITIVE_RELEVANCE),
