@@ -30,8 +30,8 @@ _FILE = "models/efficientnet-lite0-57934424.pth"
 _SIDE = 224  # pixels
 _CELLS = (6, 5)  # rows and columns: a drive is offset sideways and turned, hardly ever lifted
 _OUTPUT_BLOCKS = {7: 80, 10: 112}  # block -> its channels; both at stride 16
-_GRADIENT_SHARE = 0.5  # length of the gradient grid beside the network's 1
-_RECIPE = 1  # see `encodings_sha256`; the gradient grid is part of it
+_GRADIENT_SHARE = 0.8  # length of the gradient grid beside the network's 1
+_RECIPE = 2  # see `encodings_sha256`; the gradient grid is part of it
 _NETWORK_DIM = _CELLS[0] * _CELLS[1] * sum(_OUTPUT_BLOCKS.values())
 
 
