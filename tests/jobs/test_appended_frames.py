@@ -106,11 +106,6 @@ def test_the_maps_statistics_become_those_of_all_its_images():
     assert merged.statistics == pytest.approx(np.stack([scores.mean(axis=0), scores.std(axis=0)]))
 
 
-def test_of_two_images_at_one_position_the_old_comes_first():
-    merged = append_drive(old_map(Relevance.RRF, 4), a_drive(random_rows(2, 1), position_m=[1.0, 1.0]))
-    assert (merged.frame_digest != UNKNOWN_FRAME).tolist() == [False, False, True, True, False, False]
-
-
 def test_a_position_of_another_turn_lies_within_the_first():
     old = old_map(Relevance.RRF, 10, closed=True)  # once around is 10 m
     merged = append_drive(old, a_drive(random_rows(3, 1), position_m=[12.5, 19.75, 30.0]))

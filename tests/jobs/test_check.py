@@ -19,15 +19,16 @@ from deepsimbad.errors import (
     UnknownTraverseError,
 )
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
+from deepsimbad.jobs.remap_config import REMAP_STAGES
 from deepsimbad.store import catalog_maps, map_file
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.records import MapState
 from deepsimbad.store.traverses import Traverse
 
-DOMAIN = "route"
+from .conftest import DOMAIN
+
 PLACES, DIM = 60, 8
+ALONG_M = np.arange(PLACES)
 
 
 def season(noise, seed):
@@ -37,46 +38,71 @@ def season(noise, seed):
     return (places + noise * np.random.default_rng(seed).normal(size=(PLACES, DIM))).astype(np.float32)
 
 
+def unordered(n, seed=0, d=DIM):
+    """Encodings without any order: whoever finds its own image is first, whoever must not is anywhere."""
+    return np.random.default_rng(seed).normal(size=(n, d))
+
+
+NOISE = unordered(310)
+# Name -> what is stored of it: `good` and `bad` drives of one route, another one, `day`, to check them on, and more.
+DRIVES = {
+    "landmarks": {"encodings": season(0.2, 1)},
+    "good": {"encodings": season(0.2, 2)},
+    "bad": {"encodings": season(4.0, 3)},
+    "day": {"encodings": season(0.2, 4)},
+    "half": {"encodings": season(0.2, 5)[:30]},
+    "one": {"encodings": season(0.2, 2)[:1]},
+    "elsewhere": {"encodings": season(0.2, 5), "position_m": 1000.0 + ALONG_M},
+    "backwards": {"encodings": season(0.2, 5), "position_m": ALONG_M[::-1]},
+    "planned": {"encodings": season(0.2, 2), "x_m": 1.0 * ALONG_M, "y_m": np.zeros(PLACES)},
+    "shifted": {
+        "encodings": season(0.2, 5),
+        "position_m": 1000.0 + ALONG_M,
+        "x_m": 1.0 * ALONG_M,
+        "y_m": np.zeros(PLACES),
+    },
+    "short": {"encodings": np.eye(5, DIM - 1)},
+    "new-encoder": {"encodings": unordered(PLACES, d=DIM + 1)},
+    "its-landmarks": {"encodings": unordered(PLACES, d=DIM + 1) + 0.1},
+    "noise": {"encodings": NOISE[:300]},
+    "longer": {"encodings": NOISE},
+    "stops": {"encodings": np.repeat(NOISE[:200], 2, axis=0), "position_m": np.repeat(np.arange(200.0), 2)},
+    **{f"noise-{seed}": {"encodings": unordered(100, seed)} for seed in range(3)},
+    "long": {"encodings": unordered(2500)},
+    "long-again": {"encodings": unordered(2500), "position_m": np.arange(2500) + 0.5},
+    "longest": {"encodings": unordered(3000, 1)},
+}
+
+
 @pytest.fixture
-def store(catalog):
-    def put(name, encodings, position_m=None, x_m=None):
-        n = len(encodings)
-        frames = Drive(
-            position_m=np.arange(n, dtype=float) if position_m is None else np.asarray(position_m, float),
-            x_m=None if x_m is None else np.asarray(x_m, float),
-            y_m=None if x_m is None else np.zeros(n),
-            encodings=np.asarray(encodings, np.float32),
-        )
-        with Traverse.create(catalog.data_dir, DOMAIN, name) as traverse:
-            traverse.put_frames(frames)
+def remapped(run, store, catalog):
+    """Makes a map of one of DRIVES, and stores the drives that are named first; returns the job's result."""
 
-    return put
+    def make(training, **config):
+        config = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 0, **config}
+        for name in {training, config["landmark_traverse"], config.get("check_traverse")} & DRIVES.keys():
+            if name not in Traverse.list(catalog.data_dir, DOMAIN):
+                store(name, **DRIVES[name])
+        return run(training, **config)
+
+    return make
 
 
 @pytest.fixture
-def remapped(catalog, evaluator):
-    def run(**config):
-        parameters = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 0} | config
-        return remap(catalog, DOMAIN, RemapConfig(**parameters), evaluator, Progress(REMAP_STAGES))
-
-    return run
+def check(remapped):
+    """What the check of such a map says."""
+    return lambda training, **config: remapped(training, **config)["metrics"]["check"]
 
 
-@pytest.fixture
-def seasons(store):
-    """`good` and `bad` drives of one route, another drive `day` to check them on, and one to take landmarks from."""
-    store("landmarks", season(0.2, 1))
-    store("good", season(0.2, 2))
-    store("bad", season(4.0, 3))
-    store("day", season(0.2, 4))
+# --- what is measured ----------------------------------------------------------------------------------------------
 
 
-def test_the_first_map_has_nothing_to_be_compared_with(seasons, remapped):
-    result = remapped(training_traverse="good", gate_margin=0.0)
-    check = result["metrics"]["check"]
+def test_the_first_map_has_nothing_to_be_compared_with(remapped):
+    result = remapped("good", gate_margin=0.0)
     assert result["active"] is True
-    assert check["anr"] < 20
-    assert {name: check[name] for name in check if name != "anr"} == {
+    document = result["metrics"]["check"]
+    assert document.pop("anr") < 20
+    assert document == {
         "frames": "held_out",
         "traverse": None,
         "n_queries": 6,
@@ -91,198 +117,149 @@ def test_the_first_map_has_nothing_to_be_compared_with(seasons, remapped):
     }
 
 
-def test_without_a_gate_nothing_is_judged(seasons, remapped):
-    remapped(training_traverse="good")
-    result = remapped(training_traverse="bad", check_traverse="day")
-    assert result["active"] is True
-    check = result["metrics"]["check"]
-    assert (check["passed"], check["gate_margin"], check["why"]) == (None, None, None)
-    assert check["anr"] > check["anr_active"] + 1
-    assert check["active_version"] == 1
+def test_without_a_gate_nothing_is_judged(remapped):
+    remapped("good")
+    result = remapped("bad", check_traverse="day")
+    document = result["metrics"]["check"]
+    expected = {"passed": None, "gate_margin": None, "why": None, "active_version": 1}
+    assert {name: document[name] for name in expected} == expected
+    assert (result["active"], document["anr"] > document["anr_active"] + 1) == (True, True)
 
 
 @pytest.mark.parametrize("relevance", list(Relevance))
-def test_the_figure_is_that_of_localizations_one_by_one(seasons, remapped, catalog, evaluator, relevance):
+def test_the_figure_is_that_of_localizations_one_by_one(remapped, check, catalog, evaluator, relevance):
     """Against the slow obvious way: every frame of the drive by itself, on the map as it is served."""
-    remapped(training_traverse="bad", relevance=relevance)
-    check = remapped(training_traverse="good", relevance=relevance, check_traverse="day")["metrics"]["check"]
-    for version, figure in ((1, check["anr_active"]), (2, check["anr"])):
+    remapped("bad", relevance=relevance)
+    document = check("good", relevance=relevance, check_traverse="day")
+    for version, figure in ((1, document["anr_active"]), (2, document["anr"])):
         snapshot = load_snapshot(catalog, DOMAIN, version)
         shares = []
-        for place, encoding in enumerate(season(0.2, 4)):
+        for place, encoding in enumerate(DRIVES["day"]["encodings"]):
             dissimilarities = evaluator.dissimilarities(encoding[np.newaxis], snapshot.landmark_model)[0]
             relevance_of = relevances(snapshot, Query(rank_landmarks(dissimilarities), dissimilarities, encoding))
-            near = np.flatnonzero(np.abs(np.arange(PLACES) - place) <= 2)
+            near = np.flatnonzero(np.abs(ALONG_M - place) <= 2)
             shares.append(rank_of_truth(relevance_of, near) / PLACES)
         assert figure == pytest.approx(100 * np.mean(shares), rel=1e-6)
 
 
-def test_held_out_frames_are_not_found_as_themselves(store, remapped):
-    """Encodings without any order: whoever finds its own image is first, whoever must not is anywhere."""
-    store("landmarks", season(0.2, 1))
-    store("noise", np.random.default_rng(0).normal(size=(300, DIM)))
-    check = remapped(training_traverse="noise", relevance=Relevance.BRUTE_FORCE)["metrics"]["check"]
-    assert check["n_queries"] == 30
-    assert 8 < check["anr"] < 50  # of the best of four neighbours; 0 with the frame itself
+APPEND = {"landmark_traverse": None, "n_landmarks": None, "append": True}
 
 
-def test_the_same_traverse_again_is_no_worse_than_itself(seasons, remapped):
-    remapped(training_traverse="good")
-    result = remapped(training_traverse="good", gate_margin=0.0)
-    check = result["metrics"]["check"]
-    assert check["anr"] == pytest.approx(check["anr_active"])  # neither map may find the frames themselves
+@pytest.mark.parametrize(
+    ("steps", "frames", "n_queries", "least_anr"),
+    [
+        pytest.param([("noise", {})], "held_out", 30, 8, id="held out"),  # of the best of four neighbours
+        pytest.param([("stops", {})], "held_out", 40, 8, id="taken where a held-out frame stood"),
+        pytest.param([("noise", {}), ("longer", {**APPEND, "gate_margin": 0.0})], "held_out", 31, 8, id="known before"),
+        pytest.param(
+            [("noise-1", {}), ("noise-0", APPEND), ("noise-2", {**APPEND, "check_traverse": "noise-0"})],
+            *("traverse", 100, 4),  # of the best of nine neighbours
+            id="a check traverse that both maps have among others",
+        ),
+    ],
+)
+def test_frames_are_not_found_as_themselves(check, steps, frames, n_queries, least_anr):
+    for training, config in steps:
+        document = check(training, relevance=Relevance.BRUTE_FORCE, **config)
+    assert (document["frames"], document["n_queries"]) == (frames, n_queries)
+    assert document["active_version"] == (len(steps) - 1 or None)
+    for figure in {document["anr"], document["anr_active"]} - {None}:
+        assert least_anr < figure < 50, "0 would say that every frame found itself"
+
+
+def test_the_same_traverse_again_is_no_worse_than_itself(remapped):
+    remapped("good")
+    result = remapped("good", gate_margin=0.0)
+    document = result["metrics"]["check"]
+    assert document["anr"] == pytest.approx(document["anr_active"])  # neither map may find the frames themselves
     assert result["active"] is True
 
 
-def test_frames_taken_where_a_held_out_one_stood_are_held_out_with_it(store, remapped):
-    store("landmarks", season(0.2, 1))
-    noise = np.random.default_rng(0).normal(size=(200, DIM))
-    still = np.repeat(noise, 2, axis=0)  # every view twice, from the same place
-    store("stops", still, np.repeat(np.arange(200.0), 2))
-    check = remapped(training_traverse="stops", relevance=Relevance.BRUTE_FORCE)["metrics"]["check"]
-    assert check["n_queries"] == 40
-    assert check["anr"] > 8
-
-
-def test_frames_do_not_find_what_the_map_has_of_them_under_another_name(store, remapped):
-    """Neither held-out frames of a drive appended again with a few new ones, nor a check traverse appended before."""
-    store("landmarks", season(0.2, 1))
-    noise = np.random.default_rng(0).normal(size=(310, DIM))
-    store("noise", noise[:300])
-    remapped(training_traverse="noise", relevance=Relevance.BRUTE_FORCE)
-    store("longer", noise)
-    parameters = {"landmark_traverse": None, "append": True, "relevance": Relevance.BRUTE_FORCE, "gate_margin": 0.0}
-    check = remapped(training_traverse="longer", n_landmarks=None, **parameters)["metrics"]["check"]
-    assert check["frames"] == "held_out"
-    assert check["anr"] > 8, "0 would say that every frame found itself"
-    assert check["anr_active"] > 8
-
-
-def test_a_check_traverse_that_both_maps_have_among_others_is_asked_of_the_others(store, remapped):
-    store("landmarks", season(0.2, 1))
-    noise = np.random.default_rng(0).normal(size=(100, DIM))
-    store("noise", noise)
-    store("other", np.random.default_rng(1).normal(size=(100, DIM)))
-    store("third", np.random.default_rng(2).normal(size=(100, DIM)))
-    remapped(training_traverse="other", relevance=Relevance.BRUTE_FORCE)
-    parameters = {"landmark_traverse": None, "append": True, "n_landmarks": None, "relevance": Relevance.BRUTE_FORCE}
-    remapped(training_traverse="noise", **parameters)
-    check = remapped(training_traverse="third", check_traverse="noise", **parameters)["metrics"]["check"]
-    assert (check["frames"], check["n_queries"], check["active_version"]) == ("traverse", 100, 2)
-    assert check["anr"] > 4, "of the best of nine neighbours"
-    assert check["anr_active"] > 4
-
-
-def test_a_check_on_the_frames_that_the_new_map_is_made_of_says_so(store, remapped, seasons):
-    """Of a long drive only some are asked; what is between them was seen a moment before or after."""
-    remapped(training_traverse="good")
-    drive = np.random.default_rng(0).normal(size=(2500, DIM))
-    store("long", drive)
-    store("long-again", drive, np.arange(2500) + 0.5)
-    result = remapped(training_traverse="long", check_traverse="long-again", gate_margin=100.0)
-    check = result["metrics"]["check"]
-    assert (check["anr"], check["passed"], result["active"]) == (None, False, False)
-    assert check["why"] == "the new map was made of the frames of traverse long-again itself: check on another drive"
-
-
-def test_a_map_without_digests_is_known_by_the_names_of_its_traverses(remapped, seasons, monkeypatch):
+def test_a_map_without_digests_is_known_by_the_names_of_its_traverses(check, store, monkeypatch):
     """As maps of before are: the active one has its frames at the same places under the same name."""
+    for name in ("landmarks", "good"):
+        store(name, **DRIVES[name])
     with monkeypatch.context() as of_before:
         of_before.setattr(Drive, "digests", lambda drive: None)
-        remapped(training_traverse="good")
-    check = remapped(training_traverse="good", gate_margin=0.0)["metrics"]["check"]
-    assert check["anr"] == pytest.approx(check["anr_active"])
-    check = remapped(training_traverse="bad", check_traverse="good", gate_margin=0.0)["metrics"]["check"]
-    assert "was made of traverse good itself" in check["why"]
+        check("good")
+    document = check("good", gate_margin=0.0)
+    assert document["anr"] == pytest.approx(document["anr_active"])
+    assert "was made of traverse good itself" in check("bad", check_traverse="good", gate_margin=0.0)["why"]
 
 
-def test_a_drive_of_the_same_name_is_another_where_its_frames_are(store, remapped, seasons, catalog):
-    remapped(training_traverse="good")
+def test_a_drive_of_the_same_name_is_another_where_its_frames_are(check, store, catalog):
+    check("good")
     Traverse.delete(catalog.data_dir, DOMAIN, "good")
     store("good", season(0.2, 7))
-    check = remapped(training_traverse="bad", check_traverse="good")["metrics"]["check"]
-    assert check["anr_active"] < check["anr"]
-    assert check["n_left_out"] == 0
+    document = check("bad", check_traverse="good")
+    assert (document["anr_active"] < document["anr"], document["n_left_out"]) == (True, 0)
 
 
-def test_only_places_that_both_maps_hold_count(store, remapped, seasons):
-    remapped(training_traverse="good")
-    store("half", season(0.2, 5)[:30])
-    check = remapped(training_traverse="half", check_traverse="day")["metrics"]["check"]
-    assert (check["n_queries"], check["n_left_out"]) == (32, 28)  # 30 places, and 2 m behind them
-    assert check["anr_active"] is not None
+@pytest.mark.parametrize(
+    ("drives", "config", "n_queries", "n_left_out"),
+    [
+        pytest.param(["good", "half"], {"check_traverse": "day"}, 32, 28, id="30 places, and 2 m behind them"),
+        pytest.param(["planned", "shifted"], {}, 6, 0, id="the same in the plane, a kilometre apart along the route"),
+        pytest.param(["longest"], {"check_traverse": "long"}, 834, 0, id="a thousand frames at most"),
+        pytest.param(["longest"], {}, 300, 0, id="a tenth of a long drive"),
+    ],
+)
+def test_only_places_that_both_maps_hold_count(check, drives, config, n_queries, n_left_out):
+    *_, document = [check(training, **config) for training in drives]
+    assert (document["n_queries"], document["n_left_out"]) == (n_queries, n_left_out)
+    assert (document["anr_active"] is not None) == (len(drives) > 1)
 
 
-def test_maps_of_different_stretches_cannot_be_compared(store, remapped, seasons):
-    remapped(training_traverse="good")
-    store("elsewhere", season(0.2, 5), 1000.0 + np.arange(PLACES))
-    result = remapped(training_traverse="elsewhere", gate_margin=0.0)
-    check = result["metrics"]["check"]
-    assert (check["anr_active"], check["passed"], result["active"]) == (None, False, False)
-    assert "share no place of traverse elsewhere" in check["why"]
-    assert check["anr"] is not None
+def test_a_map_of_one_image_has_nothing_to_hold_out(remapped):
+    result = remapped("one", gate_margin=0.0)
+    expected = {"anr": None, "n_queries": 0, "n_left_out": 1, "passed": True}
+    assert {name: result["metrics"]["check"][name] for name in expected} == expected
+    assert result["active"] is True
 
 
-def test_a_check_on_the_drive_that_the_active_map_is_made_of_says_so(remapped, seasons):
-    remapped(training_traverse="good")
-    result = remapped(training_traverse="bad", check_traverse="good", gate_margin=0.0)
-    check = result["metrics"]["check"]
-    assert (check["anr_active"], check["active_version"]) == (None, 1)
-    assert (check["passed"], result["active"]) == (False, False)
-    assert "map 1, which serves, was made of traverse good itself" in check["why"]
-    assert "check on another drive" in check["why"]
+def test_a_check_on_the_drive_that_gave_a_map_its_landmarks_is_a_warning_by_name(check):
+    def warnings(**config):
+        return check("good", **config)["warnings"]
 
-
-def test_a_check_on_the_drive_that_gave_a_map_its_landmarks_is_a_warning_by_name(remapped, seasons):
-    def warned(**config):
-        return remapped(training_traverse="good", **config)["metrics"]["check"]["warnings"]
-
-    assert warned() == warned(check_traverse="day") == []
-    (of_active,) = warned(check_traverse="landmarks", landmark_traverse=None)
+    assert warnings() == warnings(check_traverse="day") == []
+    (of_active,) = warnings(check_traverse="landmarks", landmark_traverse=None)
     assert of_active.startswith("check_drive_known: map 2, which serves took its landmarks from traverse landmarks")
-    assert len(warned(check_traverse="landmarks")) == 1, "the map before kept its landmarks, and chose none"
+    assert len(warnings(check_traverse="landmarks")) == 1, "the map before kept its landmarks, and chose none"
 
 
-def test_a_map_without_any_place_of_the_check_traverse_loses_its_gate(store, remapped, seasons, catalog):
-    remapped(training_traverse="good")
-    store("elsewhere", season(0.2, 5), 1000.0 + np.arange(PLACES))
-    result = remapped(training_traverse="elsewhere", check_traverse="day", gate_margin=100.0)
-    check = result["metrics"]["check"]
-    assert (check["anr"], check["anr_active"], check["passed"], result["active"]) == (None, None, False, False)
-    assert (check["n_queries"], check["n_left_out"]) == (0, PLACES)
-    assert check["why"] == "the new map holds no place within 2 m of a frame of traverse day"
+# --- the gate ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("training", "config", "unknown", "reason"),
+    [
+        ("elsewhere", {}, ["anr_active"], "share no place of traverse elsewhere"),
+        ("elsewhere", {"check_traverse": "day"}, ["anr", "anr_active"], "holds no place within 2 m of a frame of tr"),
+        ("bad", {"check_traverse": "good"}, ["anr_active"], "was made of traverse good itself, so the two were not"),
+        ("long", {"check_traverse": "long-again"}, ["anr", "anr_active"], "made of the frames of traverse long-again"),
+        ("new-encoder", {"landmark_traverse": "its-landmarks"}, ["anr_active"], "another length"),
+    ],
+)
+def test_what_cannot_be_compared_loses_its_gate(remapped, catalog, training, config, unknown, reason):
+    remapped("good")
+    result = remapped(training, gate_margin=100.0, **config)
+    document = result["metrics"]["check"]
+    assert [name for name in ("anr", "anr_active") if document[name] is None] == unknown
+    assert reason in document["why"]
+    assert (document["passed"], document["active_version"], result["active"]) == (False, 1, False)
     assert catalog.domain(DOMAIN).active_version == 1
+    if "anr" in unknown:
+        n_frames = {"day": PLACES, "long-again": 834}[config["check_traverse"]]
+        assert (document["n_queries"], document["n_left_out"]) == (0, n_frames)
 
 
-def test_positions_in_the_plane_count_where_both_know_them(store, remapped, seasons):
-    """Along the route the two are a kilometre apart, in the plane they are the same."""
-    store("planned", season(0.2, 2), x_m=np.arange(PLACES))
-    remapped(training_traverse="planned")
-    store("shifted", season(0.2, 5), 1000.0 + np.arange(PLACES), x_m=np.arange(PLACES))
-    check = remapped(training_traverse="shifted")["metrics"]["check"]
-    assert check["anr_active"] is not None
-    assert check["n_queries"] == 6
-
-
-def test_an_active_map_of_another_encoder_cannot_be_compared(store, remapped, seasons):
-    remapped(training_traverse="good")
-    other = np.random.default_rng(0).normal(size=(PLACES, DIM + 1))
-    store("new-encoder", other)
-    store("its-landmarks", other + 0.1)
-    result = remapped(training_traverse="new-encoder", landmark_traverse="its-landmarks", gate_margin=0.0)
-    check = result["metrics"]["check"]
-    assert (check["anr_active"], check["active_version"], check["passed"]) == (None, 1, False)
-    assert "another length" in check["why"]
-
-
-def test_a_damaged_active_map_does_not_keep_its_remedy_away(remapped, seasons, catalog):
-    remapped(training_traverse="good")
+def test_a_damaged_active_map_does_not_keep_its_remedy_away(remapped, catalog):
+    remapped("good")
     path = catalog.map_path(DOMAIN, 1)
     path.chmod(0o644)
     path.write_bytes(path.read_bytes()[:-1])
-    result = remapped(training_traverse="good", gate_margin=0.0)
-    assert result["active"] is True
-    assert "damaged" in result["metrics"]["check"]["why"]
+    result = remapped("good", gate_margin=0.0)
+    assert (result["active"], "damaged" in result["metrics"]["check"]["why"]) == (True, True)
 
 
 @pytest.mark.parametrize(
@@ -293,86 +270,56 @@ def test_a_damaged_active_map_does_not_keep_its_remedy_away(remapped, seasons, c
     ],
 )
 def test_no_gate_opens_because_a_sound_map_could_not_be_read(
-    remapped, seasons, catalog, monkeypatch, module, name, error, reason
+    remapped, catalog, monkeypatch, module, name, error, reason
 ):
     def fail(*_):
         raise error
 
-    remapped(training_traverse="good")
+    remapped("good")
     monkeypatch.setattr(module, name, fail)
     with pytest.raises(UnavailableError, match="map 1 of domain route could not be read") as caught:
-        remapped(training_traverse="bad", check_traverse="day", gate_margin=1.0)
+        remapped("bad", check_traverse="day", gate_margin=1.0)
     assert (caught.value.code, caught.value.hints["reason"]) == ("unavailable", reason)
     assert [record.version for record in catalog.maps(DOMAIN)] == [1]
     assert catalog.domain(DOMAIN).active_version == 1
 
 
-def test_a_map_of_one_image_has_nothing_to_hold_out(store, remapped):
-    store("landmarks", season(0.2, 1))
-    store("one", season(0.2, 2)[:1])
-    result = remapped(training_traverse="one", gate_margin=0.0)
-    check = result["metrics"]["check"]
-    assert (check["anr"], check["n_queries"], check["n_left_out"], check["passed"]) == (None, 0, 1, True)
-    assert result["active"] is True
-
-
-def test_a_long_drive_is_checked_on_a_thousand_frames_at_most(store, remapped):
-    store("landmarks", season(0.2, 1))
-    rng = np.random.default_rng(0)
-    store("drive", rng.normal(size=(3000, DIM)))
-    store("day", rng.normal(size=(2500, DIM)))
-    assert remapped(training_traverse="drive", check_traverse="day")["metrics"]["check"]["n_queries"] == 834
-    assert remapped(training_traverse="drive")["metrics"]["check"]["n_queries"] == 300
-
-
-def test_an_unknown_or_unsuitable_check_traverse_is_named_before_anything_is_built(store, remapped, seasons, catalog):
-    with pytest.raises(UnknownTraverseError, match="nowhere"):
-        remapped(training_traverse="good", check_traverse="nowhere")
-    store("short", np.eye(5, DIM - 1))
-    with pytest.raises(InvalidEncodingError, match="short holds encodings of 7"):
-        remapped(training_traverse="good", check_traverse="short")
-    store("backwards", season(0.2, 5), np.arange(PLACES)[::-1])
-    with pytest.raises(InvalidRouteError, match="backwards at frame 1"):
-        remapped(training_traverse="good", check_traverse="backwards")
-    with pytest.raises(InvalidMapConfigError, match="another check_traverse"):
-        remapped(training_traverse="good", check_traverse="good")
+@pytest.mark.parametrize(
+    ("check_traverse", "error", "says"),
+    [
+        ("nowhere", UnknownTraverseError, "nowhere"),
+        ("short", InvalidEncodingError, "short holds encodings of 7"),
+        ("backwards", InvalidRouteError, "backwards at frame 1"),
+        ("good", InvalidMapConfigError, "another check_traverse"),
+    ],
+)
+def test_an_unsuitable_check_traverse_is_named_before_anything_is_built(remapped, catalog, check_traverse, error, says):
+    with pytest.raises(error, match=says):
+        remapped("good", check_traverse=check_traverse)
     assert catalog.maps(DOMAIN) == []
 
 
-def test_a_rollback_during_the_remap_gives_way_to_the_new_map(seasons, catalog, evaluator, remapped):
-    """Without a gate the last word wins."""
-    remapped(training_traverse="good")
-    remapped(training_traverse="bad")
-    result = remap_while(catalog, evaluator, "seal", lambda: catalog.activate(DOMAIN, 1, ANY), gate_margin=None)
-    assert result["active"] is True
-    assert catalog.domain(DOMAIN).active_version == 3
+@pytest.mark.parametrize(("gate_margin", "active_version"), [(None, 3), (0.0, 1)], ids=["no gate", "a gate"])
+def test_a_rollback_during_the_remap(remapped, catalog, gate_margin, active_version):
+    """Without a gate the last word wins; one that compared with another map does not open.
 
+    Compared with the bad map the new one passes; an operator has gone back to the good one meanwhile.
+    """
+    for training in ("good", "bad"):
+        remapped(training)
 
-def test_a_gate_that_compared_with_another_map_does_not_open(seasons, catalog, evaluator, remapped):
-    """Compared with the bad map it would pass; an operator has gone back to the good one meanwhile."""
-    remapped(training_traverse="good")
-    remapped(training_traverse="bad")
-    result = remap_while(
-        catalog, evaluator, "seal", lambda: catalog.activate(DOMAIN, 1, ANY), gate_margin=0.0, check="good"
-    )
-    check = result["metrics"]["check"]
-    assert check["active_version"] == 2
-    assert check["passed"] is True
-    assert result["active"] is False
-    assert "serves map version 1, not map version 2" in check["why"]
-    assert catalog.domain(DOMAIN).active_version == 1
-    assert catalog.map(DOMAIN, 3).state is MapState.SEALED
+    rollbacks = []
 
+    def roll_back(state):
+        if state.stage == "seal" and not rollbacks:
+            rollbacks.append(catalog.activate(DOMAIN, 1, ANY))
 
-def remap_while(catalog, evaluator, stage, meanwhile, gate_margin, check=None):
-    results = []
-
-    def at(state):
-        if state.stage == stage and not results:
-            results.append(meanwhile())
-
-    parameters = {"landmark_traverse": "landmarks", "n_landmarks": 20, "training_episodes": 10}
-    config = RemapConfig("day", check_traverse=check, gate_margin=gate_margin, **parameters)
-    result = remap(catalog, DOMAIN, config, evaluator, Progress(REMAP_STAGES, at))
-    assert results
-    return result
+    config = {"gate_margin": gate_margin, "check_traverse": None if gate_margin is None else "good"}
+    result = remapped("day", progress=Progress(REMAP_STAGES, roll_back), training_episodes=10, **config)
+    assert rollbacks
+    assert (result["active"], catalog.domain(DOMAIN).active_version) == (active_version == 3, active_version)
+    if gate_margin is not None:
+        document = result["metrics"]["check"]
+        assert (document["active_version"], document["passed"]) == (2, True)
+        assert "serves map version 1, not map version 2" in document["why"]
+        assert catalog.map(DOMAIN, 3).state is MapState.SEALED

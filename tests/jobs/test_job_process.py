@@ -28,9 +28,9 @@ from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import REMAP, BrokenJobError, InAnotherProcess, InThisProcess
 from deepsimbad.store.durable import lock_folder
-from deepsimbad.store.map_file import read_map
 
-DOMAIN = "route"
+from .conftest import DOMAIN
+
 WITHIN_S = 120
 CONFIG = RemapConfig("drive", "other", n_landmarks=8, training_episodes=200)
 COMMAND = [sys.executable, "-P", "-m", "deepsimbad.jobs.child", "idle"]
@@ -51,21 +51,15 @@ def job(catalog, drive):
     return catalog.start_job(catalog.create_job(DOMAIN, REMAP, CONFIG.as_dict()).job_id)
 
 
-def test_the_map_is_the_one_that_this_process_would_make(catalog, job, caplog):
+def test_the_map_is_the_one_that_this_process_would_make(catalog, contents, job, caplog):
     states = []
     with caplog.at_level(logging.INFO, "deepsimbad"):
         result = InAnotherProcess(catalog.data_dir, 1)(job, states.append, never)
-    assert result["map_version"] == 1
-    assert result["metrics"] == catalog.map(DOMAIN, 1).metrics
+    assert (result["map_version"], result["metrics"]) == (1, catalog.map(DOMAIN, 1).metrics)
     assert (states[0].stage, states[-1].stage) == ("read frames", "activate")
     other = catalog.start_job(catalog.create_job(DOMAIN, REMAP, CONFIG.as_dict()).job_id)
     InThisProcess(catalog.data_dir)(other, ignore, never)
-    child_map, own_map = (
-        asdict(replace(read_map(catalog.map_path(DOMAIN, v)), version=0, created_at="")) for v in (1, 2)
-    )
-    assert child_map.keys() == own_map.keys()
-    for name in child_map:
-        np.testing.assert_equal(child_map[name], own_map[name], name)
+    np.testing.assert_equal(*(asdict(replace(contents(v), version=0, created_at="")) for v in (1, 2)))
 
 
 def test_errors_come_back_by_name_with_what_helps(catalog, job):
@@ -85,14 +79,8 @@ def test_what_breaks_has_its_stack_in_the_notes_alone(catalog, job):
 def test_its_log_lines_are_the_services_with_the_jobs_id(monkeypatch, caplog):
     messages = []
     monkeypatch.setattr(child, "_tell", lambda **message: messages.append(json.loads(json.dumps(message))))
-    attributes = {
-        "name": "deepsimbad.store",
-        "levelno": logging.WARNING,
-        "msg": "%s rots",
-        "args": ("it",),
-        "file": "f",
-    }
-    child._LogToParent().emit(logging.makeLogRecord(attributes))
+    attributes = {"name": "deepsimbad.store", "levelno": logging.WARNING, "msg": "%s rots", "args": ("it",)}
+    child._LogToParent().emit(logging.makeLogRecord({**attributes, "file": "f"}))
     runner._log_here(messages[0]["log"], "j")
     record = caplog.records[-1]
     assert (record.name, record.levelname, record.getMessage()) == ("deepsimbad.store", "WARNING", "it rots")
@@ -106,10 +94,9 @@ def proc_file(pid, name):
 class Doing:
     """A job in a child that cannot begin its map."""
 
-    def __init__(self, catalog, job, caplog, run_job=None):
+    def __init__(self, job, caplog, run_job):
         self.cancelled, self.ending = threading.Event(), None
-        self._run_job = run_job or InAnotherProcess(catalog.data_dir, 3)
-        self._caplog = caplog
+        self._run_job, self._caplog = run_job, caplog
         self._thread = threading.Thread(target=self._run, args=[job])
         self._thread.start()
         self.pid = self._wait_for(self._pid)
@@ -150,10 +137,10 @@ def no_map_begins(catalog):
 
 
 @contextmanager
-def running(catalog, job, caplog, run_job=None):
+def running(catalog, job, caplog, run_job):
     with caplog.at_level(logging.INFO, "deepsimbad"):
         with no_map_begins(catalog):
-            doing = Doing(catalog, job, caplog, run_job)
+            doing = Doing(job, caplog, run_job)
             try:
                 yield doing
             finally:
@@ -161,21 +148,38 @@ def running(catalog, job, caplog, run_job=None):
         doing.end()
 
 
+SCHEDULERS = {"idle": "SCHED_IDLE", "low": "SCHED_BATCH", "normal": "SCHED_OTHER"}
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="the scheduling classes are Linux's")
 @pytest.mark.parametrize(
-    ("priority", "kind"), [("idle", "SCHED_IDLE"), ("low", "SCHED_BATCH"), ("normal", "SCHED_OTHER")]
+    ("priority", "signal_number", "message"),
+    [
+        ("idle", signal.SIGKILL, "where memory runs out"),
+        ("low", signal.SIGSEGV, "ended by SIGSEGV"),
+        ("normal", signal.SIGABRT, "ended by SIGABRT"),
+    ],
 )
-def test_it_yields_as_far_as_it_is_told_and_computes_in_the_threads_it_is_given(catalog, job, caplog, priority, kind):
+def test_it_yields_as_far_and_computes_in_the_threads_it_is_told_and_its_death_names_its_signal(
+    catalog, job, caplog, priority, signal_number, message
+):
     nice = os.getpriority(os.PRIO_PROCESS, 0) if priority == "normal" else 19
     with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3, JobPriority(priority))) as doing:
         doing.until_ready()
         for task in proc_file(doing.pid, "task").iterdir():
-            assert os.sched_getscheduler(int(task.name)) == getattr(os, kind), "every thread of it"
+            assert os.sched_getscheduler(int(task.name)) == getattr(os, SCHEDULERS[priority]), "every thread of it"
             assert os.getpriority(os.PRIO_PROCESS, int(task.name)) == nice
         assert int(proc_file(doing.pid, "oom_score_adj").read_text(encoding="ascii")) >= 500
         environment = proc_file(doing.pid, "environ").read_text(encoding="utf-8").split("\0")
         for library in ("NUMBA", "OMP", "OPENBLAS"):
             assert f"{library}_NUM_THREADS=3" in environment
+        os.kill(doing.pid, signal_number)
+        error = doing.end()
+    assert isinstance(error, JobInterruptedError)
+    assert message in error.message
+    assert error.hints == {"signal": signal_number.name}
+    words = [record.__dict__["line"] for record in caplog.records if record.getMessage() == "the job's process said"]
+    assert any("Fatal Python error" in line for line in words) == (signal_number != signal.SIGKILL)
 
 
 def test_a_cancel_is_heard(catalog, job, caplog):
@@ -187,32 +191,8 @@ def test_a_cancel_is_heard(catalog, job, caplog):
     assert catalog.maps(DOMAIN) == []
 
 
-def test_a_cancel_is_enforced(catalog, job, caplog):
-    with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 1, stops_within_s=0.2)) as doing:
-        os.kill(doing.pid, signal.SIGSTOP)
-        doing.cancelled.set()
-        error = doing.end()
-    assert isinstance(error, CancelledError)
-    assert "killed" in error.message
-
-
-@pytest.mark.parametrize(
-    ("signal_number", "message"), [(signal.SIGKILL, "where memory runs out"), (signal.SIGSEGV, "ended by SIGSEGV")]
-)
-def test_a_death_names_its_signal(catalog, job, caplog, signal_number, message):
-    with running(catalog, job, caplog) as doing:
-        doing.until_ready()
-        os.kill(doing.pid, signal_number)
-        error = doing.end()
-    words = [record.__dict__["line"] for record in caplog.records if record.getMessage() == "the job's process said"]
-    assert any("Fatal Python error" in line for line in words) == (signal_number is signal.SIGSEGV)
-    assert isinstance(error, JobInterruptedError)
-    assert message in error.message
-    assert error.hints == {"signal": signal_number.name}
-
-
 def test_what_stops_the_service_does_not_stop_its_job_first(catalog, job, caplog):
-    with running(catalog, job, caplog) as doing:
+    with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 3)) as doing:
         doing.until_ready()
         for signal_number in (signal.SIGINT, signal.SIGTERM):
             os.kill(doing.pid, signal_number)
@@ -221,6 +201,15 @@ def test_what_stops_the_service_does_not_stop_its_job_first(catalog, job, caplog
         assert doing.ending is None
         assert os.getpgid(doing.pid) != os.getpgid(0), "Ctrl-C is for the service alone"
         assert os.getsid(doing.pid) == os.getsid(0), "Linux weighs sessions against each other, whatever their classes"
+
+
+def test_a_cancel_is_enforced(catalog, job, caplog):
+    with running(catalog, job, caplog, InAnotherProcess(catalog.data_dir, 1, stops_within_s=0.2)) as doing:
+        os.kill(doing.pid, signal.SIGSTOP)
+        doing.cancelled.set()
+        error = doing.end()
+    assert isinstance(error, CancelledError)
+    assert "killed" in error.message
 
 
 def test_without_its_parent_it_ends(catalog, job):
@@ -240,13 +229,10 @@ def test_without_its_parent_it_ends(catalog, job):
 
 
 SERVICE = """
-import sys, threading
+import logging, sys
 from pathlib import Path
-from deepsimbad.jobs import child, runner
-from deepsimbad.jobs.child import JobPriority
 from deepsimbad.jobs.runner import InAnotherProcess
 from deepsimbad.store.catalog import Catalog
-import logging
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(pid)s")
 data_dir = Path(sys.argv[1])
 with Catalog.open(data_dir) as catalog:

@@ -21,6 +21,7 @@ from deepsimbad_client.recordings.annotations import as_taken
 from deepsimbad_client.recordings.sources import open_source
 
 MAX_PIXELS = 1_000_000
+READY = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
 
 
 @pytest.fixture(scope="module")
@@ -38,39 +39,47 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_images_are_encoded_as_the_service_would_encode_what_is_posted(folder, judge):
+@pytest.fixture
+def encoded(judge):
+    """Encodes a recording, or the source of one."""
+
+    def encode(recording, evaluator=judge, max_pixels=MAX_PIXELS, on_progress=lambda _: None, **options):
+        recording = recording if isinstance(recording, Recording) else open_source(str(recording))
+        return encode_recording(recording, evaluator, max_pixels, on_progress, **options)
+
+    return encode
+
+
+def test_images_are_encoded_as_the_service_would_encode_what_is_posted(folder, judge, encoded):
     recording, shares = open_source(str(folder), spacing_m=2.5), []
-    encoded = encode_recording(recording, judge, MAX_PIXELS, shares.append)
+    encoding = encoded(recording, on_progress=shares.append)
     assert shares == [place / 6 for place in range(1, 7)], "every frame is reported, broken or not"
-    assert list(encoded.left_out.values()) == [1]
-    assert encoded.drive.index.tolist() == [0, 1, 3, 4, 5]
-    assert encoded.drive.position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
-    assert encoded.drive.route().position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
-    for row, place in enumerate([0, 1, 3, 4, 5]):
+    assert list(encoding.left_out.values()) == [1]
+    drive = encoding.drive
+    assert drive.index.tolist() == [0, 1, 3, 4, 5]
+    assert drive.position_m.tolist() == drive.route().position_m.tolist() == [0.0, 2.5, 7.5, 10.0, 12.5]
+    for row, place in enumerate(drive.index):
         posted = recording.image(recording.frames[place], judge.input_size).body
-        assert np.array_equal(encoded.drive.encodings[row], judge.encode([decode_image(posted, MAX_PIXELS)])[0])
+        assert np.array_equal(drive.encodings[row], judge.encode([decode_image(posted, MAX_PIXELS)])[0])
 
 
-def test_the_readers_own_count_is_kept(folder, judge):
+def test_the_readers_own_count_is_kept(folder, encoded):
     (folder / "positions.csv").write_text("name,position_m\n0.png,0\n1.png,1\n2.png,2\n9.png,9\n")
-    recording = open_source(str(folder))
-    encoded = encode_recording(recording, judge, MAX_PIXELS, lambda _: None)
-    assert encoded.drive.index.tolist() == [0, 1]
-    assert encoded.left_out["not in positions.csv"] == 3
-    assert encoded.left_out["in positions.csv without an image"] == 1
-    assert sum(encoded.left_out.values()) == 5
+    encoding = encoded(folder)
+    assert encoding.drive.index.tolist() == [0, 1]
+    reasons = ("not in positions.csv", "in positions.csv without an image")
+    assert [encoding.left_out[reason] for reason in reasons] == [3, 1]
+    assert sum(encoding.left_out.values()) == 5
 
 
-def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, judge, tmp_path_factory):
+def test_what_an_earlier_run_kept_says_which_images_show_nothing_too(folder, encoded, tmp_path_factory):
     cv2.imwrite(str(folder / "4.png"), np.zeros((90, 160, 3), np.uint8))
-    recording, out = open_source(str(folder)), tmp_path_factory.mktemp("out")
-    with open_encoding_cache(out, "queries", source=str(folder)) as cache:
-        first = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=cache)
-    with open_encoding_cache(out, "queries", source=str(folder)) as cache:
-        again = encode_recording(recording, judge, MAX_PIXELS, lambda _: None, encoding_cache=cache)
-    assert again.encode_ms is None, "nothing was encoded"
-    assert again.drive.shows_nothing.tolist() == [False, False, False, True, False]
-    assert first.drive.shows_nothing.tolist() == again.drive.shows_nothing.tolist()
+    out = tmp_path_factory.mktemp("out")
+    for is_first in (True, False):
+        with open_encoding_cache(out, "queries", source=str(folder)) as cache:
+            encoding = encoded(folder, encoding_cache=cache)
+        assert (encoding.encode_ms is not None) == is_first, "nothing is encoded twice"
+        assert encoding.drive.shows_nothing.tolist() == [False, False, False, True, False]
 
 
 def test_a_run_that_is_killed_has_kept_what_it_encoded_now_and_then(tmp_path, monkeypatch):
@@ -91,32 +100,29 @@ def test_a_run_that_is_killed_has_kept_what_it_encoded_now_and_then(tmp_path, mo
                 assert len(second_cache) == (34 if frame == 33 else 17), "twice as many before they are written anew"
 
 
-def test_a_recording_of_broken_frames_alone_is_named(folder, judge):
-    with pytest.raises(InvalidSourceError, match="no frame that can be used"):
-        encode_recording(open_source(f"{folder}#2:3"), judge, MAX_PIXELS, lambda _: None)
+@pytest.mark.parametrize(
+    ("part", "changes", "error", "says"),
+    [
+        ("#2:3", {}, InvalidSourceError, "no frame that can be used"),
+        ("", {"max_pixels": 100}, ImageTooLargeError, "pixels"),
+        ("", {"evaluator": READY}, InvalidSourceError, "ready encodings alone"),
+    ],
+    ids=["broken frames alone", "an image over the limit", "no extractor"],
+)
+def test_what_cannot_be_encoded_is_named(folder, encoded, part, changes, error, says):
+    with pytest.raises(error, match=says):
+        encoded(f"{folder}{part}", **changes)
 
 
-def test_an_image_over_the_limit_is_an_error_not_a_broken_frame(folder, judge):
-    with pytest.raises(ImageTooLargeError):
-        encode_recording(open_source(str(folder)), judge, 100, lambda _: None)
-
-
-def test_images_need_an_extractor(folder):
-    ready = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
-    with pytest.raises(InvalidSourceError, match="ready encodings alone"):
-        encode_recording(open_source(str(folder)), ready, MAX_PIXELS, lambda _: None)
-
-
-def test_ready_encodings_are_taken_as_they_are(tmp_path, judge):
+def test_ready_encodings_are_taken_as_they_are(tmp_path, encoded):
     rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
     np.save(tmp_path / "drive.npy", rows)
-    encoded = encode_recording(open_source(f"{tmp_path / 'drive.npy'}#2:9:3"), judge, MAX_PIXELS, lambda _: None)
-    assert np.array_equal(encoded.drive.encodings, rows[2:9:3])
-    assert encoded.drive.index.tolist() == [2, 5, 8]
-    assert encoded.drive.position_m.tolist() == [2.0, 5.0, 8.0]
-    assert (encoded.drive.timestamp_us == UNKNOWN_TIMESTAMP).all()
-    assert np.isnan(encoded.drive.x_m).all()
-    assert encoded.drive.route().x_m is None
+    drive = encoded(f"{tmp_path / 'drive.npy'}#2:9:3").drive
+    assert np.array_equal(drive.encodings, rows[2:9:3])
+    assert (drive.index.tolist(), drive.position_m.tolist()) == ([2, 5, 8], [2.0, 5.0, 8.0])
+    assert (drive.timestamp_us == UNKNOWN_TIMESTAMP).all()
+    assert np.isnan(drive.x_m).all()
+    assert drive.route().x_m is None
 
 
 def recording_at(*positions_m):
@@ -128,16 +134,20 @@ def recording_at(*positions_m):
     return Recording("placed", frames, encodings=np.eye(3, dtype=np.float32))
 
 
-def test_ground_coordinates_and_times_are_kept(judge):
-    encoded = encode_recording(recording_at(0, 1, 2), judge, MAX_PIXELS, lambda _: None)
-    assert encoded.drive.timestamp_us.tolist() == [0, 1, 2]
-    np.testing.assert_array_equal(encoded.drive.route().x_m, [0.0, np.nan, 2.0])
-    np.testing.assert_array_equal(encoded.drive.route().y_m, [2.0, 2.0, 2.0])
-
-
-def test_positions_that_go_backwards_are_named(judge):
+def test_ground_coordinates_and_times_are_kept_and_positions_that_go_backwards_named(encoded):
+    drive = encoded(recording_at(0, 1, 2)).drive
+    assert drive.timestamp_us.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal([drive.route().x_m, drive.route().y_m], [[0.0, np.nan, 2.0], [2.0, 2.0, 2.0]])
     with pytest.raises(InvalidRouteError, match="frame 2"):
-        encode_recording(recording_at(0, 2, 1), judge, MAX_PIXELS, lambda _: None)
+        encoded(recording_at(0, 2, 1))
+
+
+def test_a_frame_that_is_told_wrongly_is_named(folder, encoded):
+    scenes = {"0.png": [], "1.png": [{"label": "car", "box": [10, 20, 100, 200]}]}
+    lines = (json.dumps({"name": name, "objects": scene}) for name, scene in scenes.items())
+    (folder / "detections.jsonl").write_text("\n".join(lines))
+    with pytest.raises(InvalidSceneError, match=r"^1\.png: object 0: a box is"):
+        encoded(as_taken(open_source(str(folder)), {"objects"}), make_evaluator(evaluator_config({"kind": "objects"})))
 
 
 # --- ground truth --------------------------------------------------------------------------------------------------
@@ -173,15 +183,6 @@ def test_every_form_of_ground_truth(tmp_path, array, test_index, training_index,
     np.save(tmp_path / "truth.npy", array, allow_pickle=True)
     truths = read_ground_truth(tmp_path / "truth.npy", np.array(test_index), np.array(training_index))
     assert [truth.tolist() for truth in truths] == expected
-
-
-def test_a_frame_that_is_told_wrongly_is_named(folder):
-    objects = {"0.png": [], "1.png": [{"label": "car", "box": [10, 20, 100, 200]}]}
-    lines = (json.dumps({"name": name, "objects": scene}) for name, scene in objects.items())
-    (folder / "detections.jsonl").write_text("\n".join(lines))
-    recording = as_taken(open_source(str(folder)), {"objects"})
-    with pytest.raises(InvalidSceneError, match=r"^1\.png: object 0: a box is"):
-        encode_recording(recording, make_evaluator(evaluator_config({"kind": "objects"})), MAX_PIXELS, lambda _: None)
 
 
 class Malice:

@@ -12,10 +12,13 @@ from deepsimbad.jobs.runner import InThisProcess, JobRunner
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobState
 
-DOMAIN = "route"
+from .conftest import DOMAIN
 
 WITHIN_S = 120
 CONFIG = RemapConfig("drive", "other", n_landmarks=8)
+ANOTHER = RemapConfig("drive", "other", n_landmarks=7)
+
+pytestmark = pytest.mark.usefixtures("two_drives")
 
 
 class Gate:
@@ -29,6 +32,11 @@ class Gate:
         self.entered.set()
         assert self.open.wait(WITHIN_S)
         return self.run_job(job, on_progress, is_cancelled)
+
+
+@pytest.fixture
+def gate(catalog):
+    return Gate(catalog.data_dir)
 
 
 @contextmanager
@@ -50,48 +58,50 @@ def ended_job(catalog, job_id):
     raise AssertionError(f"job {job_id} did not end: {job}")
 
 
-@pytest.fixture
-def drives(drive):
-    drive("other", 30, seed=1)
-    drive("drive", 12)
+def close_while_one_runs(runner, gate):
+    """Ask the runner to end, and let the job through that it waits for."""
+    closing = threading.Thread(target=runner.close)
+    closing.start()
+    gate.open.set()
+    closing.join(WITHIN_S)
+    assert not closing.is_alive()
 
 
-def test_a_job_of_one_id_is_made_once_whoever_asks_and_whenever(catalog, drives):
-    gate = Gate(catalog.data_dir)
-    job_id, job_ids = "a" * 32, []
+def test_a_job_of_one_id_is_made_once_whoever_asks_and_whenever(catalog, gate):
+    first_id, second_id, job_ids = "a" * 32, "b" * 32, []
     runner = JobRunner(catalog, gate, lambda domain: None, max_waiting=1)
     try:
-        first = runner.submit(DOMAIN, CONFIG, job_id)
+        first = runner.submit(DOMAIN, CONFIG, first_id)
         assert gate.entered.wait(WITHIN_S)
-        other = threading.Barrier(8)
+        all_at_once = threading.Barrier(8)
 
         def ask():
-            other.wait(WITHIN_S)
-            job_ids.append(runner.submit(DOMAIN, CONFIG, "b" * 32).job_id)
+            all_at_once.wait(WITHIN_S)
+            job_ids.append(runner.submit(DOMAIN, CONFIG, second_id).job_id)
 
         asking = [threading.Thread(target=ask) for _ in range(8)]
         for thread in asking:
             thread.start()
         for thread in asking:
             thread.join(WITHIN_S)
-        assert job_ids == ["b" * 32] * 8, "one alone finds room to wait; the others find that one"
+        assert job_ids == [second_id] * 8, "one alone finds room to wait; the others find that one"
         with pytest.raises(IdempotencyKeyReusedError):
-            runner.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=7), job_id)
+            runner.submit(DOMAIN, ANOTHER, first_id)
         gate.open.set()
-        ended_job(catalog, "b" * 32)
+        ended_job(catalog, second_id)
     finally:
         gate.open.set()
         runner.close()
-    assert runner.submit(DOMAIN, CONFIG, job_id).state is JobState.SUCCEEDED, "nothing new is asked of it"
+    assert runner.submit(DOMAIN, CONFIG, first_id).state is JobState.SUCCEEDED, "nothing new is asked of it"
     with running(catalog) as again:
-        job = again.submit(DOMAIN, CONFIG, job_id)
-        assert (job.job_id, job.created_at, job.result["map_version"]) == (job_id, first.created_at, 1)
+        job = again.submit(DOMAIN, CONFIG, first_id)
+        assert (job.job_id, job.created_at, job.result["map_version"]) == (first_id, first.created_at, 1)
         with pytest.raises(IdempotencyKeyReusedError):
-            again.submit(DOMAIN, RemapConfig("drive", "other", n_landmarks=7), job_id)
+            again.submit(DOMAIN, ANOTHER, first_id)
     assert [record.version for record in catalog.maps(DOMAIN)] == [1, 2]
 
 
-def test_a_job_that_meets_damage_says_in_which_traverse(catalog, drives):
+def test_a_job_that_meets_damage_says_in_which_traverse(catalog):
     path = catalog.data_dir / "domains" / DOMAIN / "traverses" / "other.sqlite"
     path.write_bytes(b"no database" * 1000)
     with running(catalog) as runner:
@@ -100,53 +110,40 @@ def test_a_job_that_meets_damage_says_in_which_traverse(catalog, drives):
     assert job.error["message"].startswith("other.sqlite is damaged")
 
 
-def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog, drives):
-    gate = Gate(catalog.data_dir)
+def test_a_running_job_is_cancelled_at_its_next_report_and_leaves_no_map(catalog, gate):
     with running(catalog, gate) as runner:
         job = runner.submit(DOMAIN, CONFIG)
         assert gate.entered.wait(WITHIN_S)
         runner.cancel(job.job_id)
         gate.open.set()
         job = ended_job(catalog, job.job_id)
-        assert job.state is JobState.CANCELLED
-        assert job.error["code"] == "cancelled"
-        assert catalog.maps(DOMAIN) == []
+        assert (job.state, job.error["code"], catalog.maps(DOMAIN)) == (JobState.CANCELLED, "cancelled", [])
         assert ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED, "it goes on"
 
 
-def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog, drives, caplog):
-    broken = [True]
-    sound_run = InThisProcess(catalog.data_dir)
+def test_a_job_that_breaks_tells_no_inner_detail_and_the_runner_goes_on(catalog, caplog):
+    outcomes = [ZeroDivisionError("secret"), None]
 
-    def run_job(job, on_progress, is_cancelled):
-        if broken.pop():
-            raise ZeroDivisionError("secret")
-        return sound_run(job, on_progress, is_cancelled)
+    def run_job(*job):
+        if error := outcomes.pop(0):
+            raise error
+        return InThisProcess(catalog.data_dir)(*job)
 
     with running(catalog, run_job) as runner:
-        job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
-        broken.append(False)
-        assert ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id).state is JobState.SUCCEEDED
-    assert job.state is JobState.FAILED
-    assert job.error["code"] == "internal_error"
+        job, next_job = (ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id) for _ in range(2))
+    assert (job.state, job.error["code"], next_job.state) == (JobState.FAILED, "internal_error", JobState.SUCCEEDED)
     assert "secret" not in str(job.error)
     assert "secret" in caplog.text, "the log has it"
 
 
-def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, drives):
-    gate = Gate(catalog.data_dir)
+def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, gate):
     runner = JobRunner(catalog, gate, lambda domain: None)
     first, second = (runner.submit(DOMAIN, CONFIG) for _ in range(2))
     assert gate.entered.wait(WITHIN_S)
-    closing = threading.Thread(target=runner.close)
-    closing.start()
-    gate.open.set()
-    closing.join(WITHIN_S)
-    assert not closing.is_alive()
+    close_while_one_runs(runner, gate)
     stopped = catalog.job(first.job_id)
     assert (stopped.state, stopped.n_starts, stopped.stage) == (JobState.QUEUED, 0, None)
-    assert catalog.job(second.job_id).state is JobState.QUEUED
-    assert catalog.maps(DOMAIN) == []
+    assert (catalog.job(second.job_id).state, catalog.maps(DOMAIN)) == (JobState.QUEUED, [])
     with pytest.raises(UnavailableError, match="shutting down"):
         runner.submit(DOMAIN, CONFIG)
     data_dir = catalog.data_dir
@@ -158,22 +155,17 @@ def test_closing_leaves_what_runs_and_what_waits_to_the_next_service(catalog, dr
         assert again.discard_unfinished() == []
 
 
-def test_a_job_that_was_cancelled_as_the_service_stops_stays_cancelled(catalog, drives):
-    gate = Gate(catalog.data_dir)
+def test_a_job_that_was_cancelled_as_the_service_stops_stays_cancelled(catalog, gate):
     runner = JobRunner(catalog, gate, lambda domain: None)
     job = runner.submit(DOMAIN, CONFIG)
     assert gate.entered.wait(WITHIN_S)
     runner.cancel(job.job_id)
-    closing = threading.Thread(target=runner.close)
-    closing.start()
-    gate.open.set()
-    closing.join(WITHIN_S)
+    close_while_one_runs(runner, gate)
     assert catalog.job(job.job_id).state is JobState.CANCELLED
 
 
-def dying(catalog, is_before):
-    """Does a job until its process dies, before or after its last step."""
-
+@pytest.mark.parametrize("is_before", [True, False], ids=["before its last step", "behind it"])
+def test_a_job_whose_process_died_has_succeeded_if_its_map_is_there_and_leaves_no_half_map(catalog, is_before):
     def run_job(job, on_progress, is_cancelled):
         if not is_before:
             InThisProcess(catalog.data_dir)(job, on_progress, is_cancelled)
@@ -182,21 +174,14 @@ def dying(catalog, is_before):
             child.building_path(DOMAIN, version).write_bytes(b"half a map")
         raise JobInterruptedError("the job's process was ended by SIGKILL", signal="SIGKILL")
 
-    return run_job
-
-
-def test_a_job_whose_process_died_has_failed_and_leaves_no_half_map(catalog, drives):
-    with running(catalog, dying(catalog, is_before=True)) as runner:
-        job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
-    assert job.state is JobState.FAILED
-    assert (job.error["code"], job.error["signal"]) == ("job_interrupted", "SIGKILL")
-    assert catalog.maps(DOMAIN) == []
-    assert not catalog.building_path(DOMAIN, 1).exists()
-
-
-def test_a_job_whose_process_died_behind_its_last_step_has_succeeded(catalog, drives):
     activated = []
-    with running(catalog, dying(catalog, is_before=False), activated.append) as runner:
+    with running(catalog, run_job, activated.append) as runner:
         job = ended_job(catalog, runner.submit(DOMAIN, CONFIG).job_id)
-    assert (job.state, job.result["map_version"], job.error) == (JobState.SUCCEEDED, 1, None)
-    assert activated == [DOMAIN]
+    if is_before:
+        assert job.state is JobState.FAILED
+        assert (job.error["code"], job.error["signal"]) == ("job_interrupted", "SIGKILL")
+    else:
+        assert (job.state, job.result["map_version"], job.error) == (JobState.SUCCEEDED, 1, None)
+    assert [record.version for record in catalog.maps(DOMAIN)] == ([] if is_before else [1])
+    assert activated == ([] if is_before else [DOMAIN])
+    assert list(catalog.map_path(DOMAIN, 1).parent.glob("*.building")) == []

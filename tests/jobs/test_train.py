@@ -1,23 +1,26 @@
 """Which live images a map is trained on, and what remaps keep of it."""
 
 from dataclasses import replace
+from functools import partial
+from itertools import repeat
 
 import numpy as np
 import pytest
 
 from deepsimbad.core.building import MapPlan, build_map, compose_map
+from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.experience.nnql import NnqlConfig
+from deepsimbad.core.experience.nnql import KnownWalk, NnqlConfig
 from deepsimbad.core.experience.training import TrainingWorld
-from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.errors import CancelledError
 from deepsimbad.jobs.build import HELD_OUT, SECOND_DRIVE, train_nnql
 from deepsimbad.jobs.progress import Progress
-from deepsimbad.jobs.remap import remap
-from deepsimbad.jobs.remap_config import REMAP_STAGES, RemapConfig
-from deepsimbad.store.map_file import read_map
+from deepsimbad.jobs.remap_config import REMAP_STAGES
+from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
 
-DOMAIN = "route"
+from .conftest import DOMAIN
+
 N, R = 90, 20
 
 
@@ -59,13 +62,11 @@ def worlds(monkeypatch):
 def test_a_second_drive_of_the_route_gives_the_live_images(worlds):
     map_drive, second = drives()
     q_values, metrics = train_map(second=second, map_drive=map_drive)
-    assert metrics["live_images"] == SECOND_DRIVE
-    assert metrics["n_episodes"] == 200
+    assert (metrics["live_images"], metrics["n_episodes"]) == (SECOND_DRIVE, 200)
     ((map_, views, _),) = worlds
     assert map_.n_images == N
     assert views.dissimilarities is second.dissimilarities
-    assert q_values.shape == (N, 3)
-    assert q_values.dtype == np.float32
+    assert (q_values.shape, q_values.dtype) == ((N, 3), np.float32)
     assert (q_values > 1).mean() > 0.5
 
 
@@ -118,26 +119,31 @@ def test_progress_rises_and_a_cancel_gets_through():
             train_map(second=second, on_progress=cancel)
 
 
-def remap_config(**changes):
-    return RemapConfig(**{"training_traverse": "drive", "landmark_traverse": "other", "n_landmarks": 8} | changes)
-
-
-def test_a_remap_stores_what_it_learnt(catalog, drive, evaluator, quiet):
-    drive("other", 30, seed=1)
-    drive("drive", 12)
+def test_a_remap_stores_what_it_learnt(catalog, two_drives, run, contents):
+    config = {"landmark_traverse": "other", "n_landmarks": 8}
     stages: list[str] = []
     progress = Progress(REMAP_STAGES, lambda state: stages.append(state.stage))
-    result = remap(catalog, DOMAIN, remap_config(), evaluator, progress)
+    training = run("drive", progress=progress, **config)["metrics"]["training"]
     assert "train" in stages
-    training = result["metrics"]["training"]
-    assert training["n_episodes"] == 300
-    assert training["live_images"] == HELD_OUT
+    assert (training["n_episodes"], training["live_images"]) == (300, HELD_OUT)
     assert all(0 <= share <= 1 for curve in training["curves"] for share in curve["reward_share"])
     assert training["hyperparameters"]["learning_rate"] == 0.1
     assert catalog.map(DOMAIN, 1).metrics["training"] == training
-    q_values = read_map(catalog.map_path(DOMAIN, 1)).q_values
-    assert q_values.shape == (12, 2)
-    again = remap(catalog, DOMAIN, remap_config(), evaluator, quiet)
-    assert np.array_equal(read_map(catalog.map_path(DOMAIN, again["map_version"])).q_values, q_values)
-    other_seed = remap(catalog, DOMAIN, remap_config(seed=1), evaluator, Progress(REMAP_STAGES))
-    assert not np.array_equal(read_map(catalog.map_path(DOMAIN, other_seed["map_version"])).q_values, q_values)
+    for seed in (0, 1):
+        run("drive", seed=seed, **config)
+    q_values = [contents(version).q_values for version in (1, 2, 3)]
+    assert q_values[0].shape == (12, 2)
+    assert [np.array_equal(values, q_values[0]) for values in q_values] == [True, True, False]
+
+
+def test_a_cancel_of_learning_from_a_session_leaves_nothing(catalog, two_drives, run, contents, evaluator):
+    """One along a mapped route, that saw just what the map saw."""
+    run("drive", landmark_traverse="other", n_landmarks=8, training_episodes=0)
+    frames = np.arange(1, 11, 2)
+    ranks = rank_landmarks(evaluator.dissimilarities(two_drives[1][frames], contents(1).landmark_model))
+    walk = KnownWalk([Query(row) for row in ranks], np.full(frames.size, 2.0), frames.astype(float))
+    for answers in (repeat(True), iter([False, False, False, True])):
+        with pytest.raises(CancelledError):
+            learn_online(catalog, DOMAIN, [walk], Progress(LEARN_STAGES, is_cancelled=partial(next, answers)))
+    assert [record.version for record in catalog.maps(DOMAIN)] == [1]
+    assert catalog.domain(DOMAIN).active_version == 1
