@@ -43,16 +43,15 @@ def full_map(**changes):
         ({"statistics": None}, "a map for composed needs statistics"),
         ({"usual_encoding": None}, "needs usual_encoding"),
         ({"actions_m": (1.0, "2")}, "no metres"),
+        ({"position_m": np.arange(float(N))[::-1]}, "backwards"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(changes, says):
-    with pytest.raises(InvalidMapConfigError, match=says):
+    with pytest.raises((InvalidMapConfigError, InvalidRouteError), match=says):
         full_map(**changes)
 
 
-def test_a_route_that_goes_backwards_and_an_unknown_relevance_are_refused():
-    with pytest.raises(InvalidRouteError):
-        full_map(position_m=np.arange(float(N))[::-1])
+def test_an_unknown_relevance_is_refused():
     with pytest.raises(ValueError, match="telepathy"):
         _ = full_map(config={"relevance": "telepathy", "n_landmarks": R}).relevance
 
@@ -100,7 +99,7 @@ def test_a_part_of_its_images_and_those_put_together_again():
     map_ = full_map()
     images, other_images = np.array([0, 1, 4, 6]), np.array([2, 3, 5, 7])
     part = map_.at(images)
-    assert part.position_m.tolist() == [0, 1, 4, 6]
+    assert part.position_m.tolist() == images.tolist()
     assert np.array_equal(part.lists, map_.lists[:, images])
     assert np.array_equal(part.q_values, map_.q_values[images])
     assert part.statistics is map_.statistics

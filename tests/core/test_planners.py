@@ -11,7 +11,6 @@ from deepsimbad.core.planners import (
     plan_at_random,
     plan_by_experience,
     plan_by_information,
-    plan_constantly,
 )
 from deepsimbad.errors import InvalidInputError
 
@@ -81,11 +80,10 @@ def test_the_value_of_a_move_is_what_views_from_there_on_are_worth(closed, actio
         np.testing.assert_allclose(table[:, : len(actions_m)], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("away", [1, 4, 9])
-def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away):
-    plan = plan_by_information(view_of(sharp(74 - away), bits))
-    assert plan.action_m == away
-    assert plan.values.argmax() == away - 1
+@pytest.mark.parametrize(("away", "to"), [(1, 74), (4, 74), (9, 74), (3, N_IMAGES)])  # on a loop the last is place 0
+def test_a_robot_that_knows_its_place_goes_to_the_telling_one(bits, away, to):
+    plan = plan_by_information(view_of(sharp(to - away), bits, closed=to == N_IMAGES))
+    assert (plan.action_m, plan.values.argmax()) == (away, away - 1)
 
 
 def test_where_nobody_knows_what_views_tell_it_goes_far():
@@ -107,8 +105,7 @@ def test_where_nobody_knows_what_views_tell_it_goes_far():
 def test_no_move_leads_past_an_end_while_another_stays(place, actions_m, expected_m, known_bits):
     flat = np.ones(N_IMAGES, np.float32) if known_bits else None
     plan = plan_by_information(view_of(sharp(place), flat, actions_m=np.array(actions_m)))
-    assert plan.action_m == expected_m
-    assert plan.chance_on_route > 0.97
+    assert (plan.action_m, plan.chance_on_route > 0.97) == (expected_m, True)
 
 
 def test_where_every_move_leads_past_the_end_it_is_the_one_that_most_probably_stays():
@@ -158,11 +155,6 @@ def test_tables_of_few_prices_are_kept(bits):
     assert (information_ahead(map_, 0.0) == tables[0.0]).all()
 
 
-def test_a_closed_route_goes_on_behind_its_end(bits):
-    at_end = sharp(N_IMAGES - 3)
-    assert plan_by_information(view_of(at_end, bits, closed=True)).action_m == 3, "place 0 tells seven bits"
-
-
 # --- the paper's ---------------------------------------------------------------------------------------------------
 
 
@@ -174,28 +166,17 @@ def test_nnql_averages_the_rows_of_the_most_relevant_images():
     nearest = sorted(range(N_IMAGES), key=lambda m: -relevance[m])[:4]
     expected = [np.mean([q_values[m, a] for m in nearest]) for a in range(10)]
     np.testing.assert_allclose(plan.values, expected, rtol=1e-6)
-    assert plan.action_m == ACTIONS_M[int(np.argmax(expected))]
-    assert plan.planner == "nnql"
-
-
-def test_nnql_knows_nothing_without_experience_or_a_view():
-    relevance, q_values = np.ones(N_IMAGES, np.float32), np.ones((N_IMAGES, 10), np.float32)
-    assert plan_by_experience(view_of(relevance=relevance)) is None
-    assert plan_by_experience(view_of(q_values=q_values)) is None
-
-
-def test_the_same_move_always():
-    for mass in (None, sharp(7)):
-        assert plan_constantly(4.0, view_of(mass)).action_m == 4
+    assert (plan.planner, plan.action_m) == ("nnql", ACTIONS_M[int(np.argmax(expected))])
+    for options in ({"relevance": relevance}, {"q_values": q_values}):
+        assert plan_by_experience(view_of(**options)) is None, "without experience, or a view"
 
 
 def test_random_moves_are_drawn_alike_from_the_seed_and_the_step():
-    moves = [plan_at_random(view_of(seed=3, step=step)).action_m for step in range(2000)]
+    moves, again, other = (
+        [plan_at_random(view_of(seed=seed, step=step)).action_m for step in range(2000)] for seed in (3, 3, 4)
+    )
     counts = np.bincount(np.array(moves, int), minlength=11)[1:]
-    assert counts.sum() == 2000
-    assert abs(counts - 200).max() < 60
-    again = [plan_at_random(view_of(seed=3, step=step)).action_m for step in range(2000)]
-    other = [plan_at_random(view_of(seed=4, step=step)).action_m for step in range(2000)]
+    assert (counts.sum(), abs(counts - 200).max() < 60) == (2000, True)
     assert again == moves != other
 
 

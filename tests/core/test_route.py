@@ -8,12 +8,23 @@ from hypothesis import strategies as st
 from deepsimbad.core.route import Route, same_places, true_images_of
 from deepsimbad.errors import InvalidRouteError
 
+SQUARE = {"x_m": np.array([0.0, 10, 10, 0]), "y_m": np.array([0.0, 0, 10, 10])}
 
-def test_even_spacing_has_equal_cells():
-    for closed in (False, True):
-        route = Route(np.arange(5) * 2.0, closed)
-        assert route.length_m == (10.0 if closed else 8.0)
-        np.testing.assert_allclose(route.cell_m, 2.0)
+
+@pytest.mark.parametrize(
+    ("route", "length_m", "cell_m"),
+    [
+        pytest.param(Route(np.arange(5) * 2.0), 8, [2] * 5, id="even spacing"),
+        pytest.param(Route(np.arange(5) * 2.0, closed=True), 10, [2] * 5, id="a loop"),
+        pytest.param(Route(np.arange(4) * 10.0, closed=True, **SQUARE), 40, [10] * 4, id="the gap is the plane's"),
+        pytest.param(Route(np.array([0.0, 1, 2, 2, 2, 2, 3, 4])), 4, [1, 1, 0.5, 0, 0, 0.5, 1, 1], id="a stop"),
+        pytest.param(Route(np.full(3, 7.0)), 0, [1] * 3, id="no length"),
+        pytest.param(Route(np.array([4.0])), 0, [1], id="one image"),
+    ],
+)
+def test_length_and_cells(route, length_m, cell_m):
+    assert route.length_m == length_m
+    np.testing.assert_allclose(route.cell_m, cell_m)
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -33,27 +44,6 @@ def test_a_bin_of_the_histogram_holds_what_lies_in_it(n, closed):
         length_m = np.maximum(until_m - from_m, 1e-12)
         points = (until_m == from_m) & (until_m > first_m) & (until_m <= last_m)
         assert share == pytest.approx(mass @ (within_m / length_m) + mass[points].sum() + (n == 1), abs=1e-9)
-
-
-def test_a_stop_shares_one_cell():
-    route = Route(np.array([0.0, 1.0, 2.0, 2.0, 2.0, 2.0, 3.0, 4.0]))
-    np.testing.assert_allclose(route.cell_m[2:6].sum(), 1.0)
-
-
-def test_a_route_of_no_length_has_equal_cells():
-    np.testing.assert_allclose(Route(np.full(3, 7.0)).cell_m, 1.0)
-    assert Route(np.array([4.0])).length_m == 0.0
-
-
-def test_a_closed_route_that_only_its_gap_makes_too_short_is_refused():
-    with pytest.raises(InvalidRouteError, match="m long"):
-        Route(np.zeros(2), closed=True, x_m=np.array([0.0, 1e-310]), y_m=np.zeros(2))
-
-
-def test_closing_gap_is_taken_from_the_plane():
-    square = np.array([[0, 0], [10, 0], [10, 10], [0, 10]], float)
-    route = Route(np.array([0.0, 10, 20, 30]), closed=True, x_m=square[:, 0], y_m=square[:, 1])
-    assert route.length_m == 40.0
 
 
 def test_offsets_take_the_short_way_round():
@@ -81,6 +71,11 @@ def test_of_two_images_equally_near_the_one_before_counts(closed):
 def test_bad_positions_are_named(positions, says):
     with pytest.raises(InvalidRouteError, match=says):
         Route(np.array(positions, float))
+
+
+def test_a_closed_route_that_only_its_gap_makes_too_short_is_refused():
+    with pytest.raises(InvalidRouteError, match="m long"):
+        Route(np.zeros(2), closed=True, x_m=np.array([0.0, 1e-310]), y_m=np.zeros(2))
 
 
 def test_an_open_route_ends_and_a_closed_one_does_not():
@@ -127,17 +122,23 @@ def test_the_window_along_the_route_finds_what_looking_at_all_finds(seed, closed
     assert [ids.tolist() for ids in true_images_of(query, map_route, tolerance_m)] == expected
 
 
-def test_the_nearest_is_paired():
-    map_route = Route(np.arange(5.0), x_m=np.arange(5.0), y_m=np.zeros(5))
-    frames = Route(np.arange(3.0), x_m=np.array([0.9, 3.2, 90.0]), y_m=np.zeros(3))
-    assert same_places(frames, map_route).tolist() == [[1, 0], [3, 1]]
-    assert same_places(frames, map_route, tolerance_m=np.inf).tolist() == [[1, 0], [3, 1], [4, 2]]
-
-
-def test_truth_along_the_route():
-    route = Route(np.arange(6.0))
-    true_images = true_images_of(Route(np.array([0.0, 3.4, 9.0])), route, 2.0)
-    assert [ids.tolist() for ids in true_images] == [[0, 1, 2], [2, 3, 4, 5], []]
+@pytest.mark.parametrize(
+    ("frames", "pairs"),
+    [
+        pytest.param(Route(np.array([0.4, 5.6, 30.0])), [[0, 0], [6, 1]], id="along the route"),
+        pytest.param(
+            Route(np.arange(4.0), x_m=np.array([0.9, 3.2, 3.4, 90.0]), y_m=np.full(4, 0.3)),
+            [[1, 0], [3, 1], [3, 2]],
+            id="in the plane",
+        ),
+    ],
+)
+def test_same_places_are_the_nearest_within_the_tolerance(frames, pairs):
+    x_m = np.arange(10.0)
+    map_route = Route(x_m, x_m=x_m, y_m=np.zeros(10))
+    assert same_places(frames, map_route).tolist() == pairs
+    last = [9, frames.n_images - 1]
+    assert same_places(frames, map_route, tolerance_m=np.inf).tolist() == [*pairs, last]
 
 
 def test_truth_in_the_plane_needs_the_same_direction():
@@ -157,18 +158,6 @@ def test_truth_in_the_plane_finds_both_visits_of_a_place():
     assert {100, 0} <= set(true_images[100].tolist()) | set(true_images[0].tolist())
     assert all(abs(i - 50) < 3 or abs(i - 149.5) < 3 for i in true_images[50].tolist())
     assert len(true_images[50]) >= 2
-
-
-def test_same_places_are_the_nearest_within_the_tolerance():
-    frames, route = Route(np.array([0.4, 5.6, 30.0])), Route(np.arange(10.0))
-    assert same_places(frames, route).tolist() == [[0, 0], [6, 1]]
-
-
-def test_same_places_in_the_plane():
-    x = np.arange(10.0)
-    route = Route(x, x_m=x, y_m=np.zeros(10))
-    frames = Route(np.array([0.0, 3.0]), x_m=np.array([2.2, 5.2]), y_m=np.array([0.3, 0.3]))
-    assert same_places(frames, route).tolist() == [[2, 0], [5, 1]]
 
 
 def test_distance_is_in_the_plane_where_both_sides_know_it_else_along_the_route():

@@ -100,23 +100,15 @@ def test_uneven_images_take_the_cell_nearest_to_them():
     assert rank[0] == 1 + 0.5  # the image at 1.9 is better, the other at 3.0 is tied
 
 
-def test_a_belief_that_would_be_wholly_past_the_end_stays():
+def test_a_belief_that_would_be_wholly_past_the_end_stays_and_evidence_against_every_place_is_not_believed():
     lattice = Lattice.of_route(equal_route(10, 1.0, closed=False), np.ones(1))
-    beliefs = np.zeros((1, 10), np.float32)
-    beliefs[0, 8] = 1
+    beliefs = np.eye(10, dtype=np.float32)[[8]]
     moves = moves_along(lattice, (3.0,), (0.0,))
     rank = step_beliefs(lattice, beliefs, moves, np.ones((1, 10), np.float32), np.array([8]), additive=False)
-    assert rank[0] == 0
-    assert beliefs[0].argmax() == 8
-
-
-def test_evidence_against_every_place_is_not_believed():
-    lattice = Lattice.of_route(equal_route(10, 1.0, closed=False), np.ones(1))
-    beliefs = uniform_beliefs(lattice, 1)
-    moves = moves_along(lattice, (1.0,), (0.0,))
+    assert (rank[0], beliefs[0].argmax()) == (0, 8)
+    beliefs, moves = uniform_beliefs(lattice, 1), moves_along(lattice, (1.0,), (0.0,))
     step_beliefs(lattice, beliefs, moves, np.zeros((1, 10), np.float32), np.array([8]), additive=False)
-    assert beliefs[0, 0] == 0
-    assert np.allclose(beliefs[0, 1:], 10 / 9)
+    np.testing.assert_allclose(beliefs[0], [0, *[10 / 9] * 9], rtol=1e-5)
 
 
 def test_one_place_and_one_image():

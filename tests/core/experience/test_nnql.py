@@ -56,14 +56,8 @@ def test_the_defaults_are_the_papers():
 @pytest.mark.parametrize(
     "bad",
     [
-        {"n_episodes": -1},
-        {"n_neighbours": 0},
-        {"batch_episodes": 0},
-        {"exploration": 1.5},
-        {"learning_rate": float("nan")},
-        {"reward": float("inf")},
-        {"motion_std_m": -1.0},
-        {"seed": -1},
+        *({"n_episodes": -1}, {"n_neighbours": 0}, {"batch_episodes": 0}, {"exploration": 1.5}),
+        *({"learning_rate": float("nan")}, {"reward": float("inf")}, {"motion_std_m": -1.0}, {"seed": -1}),
     ],
 )
 def test_impossible_hyperparameters(bad):

@@ -105,8 +105,7 @@ def test_the_seed_decides_and_threads_do_not():
     with ThreadPoolExecutor(2) as pool:
         pool_q_values, pool_curve = train(world, config, lambda _: None, pool)
     assert np.array_equal(q_values, pool_q_values)
-    assert curve == pool_curve
-    assert len(curve.reward_share) == 3
+    assert (pool_curve, len(curve.reward_share)) == (curve, 3)
     other_q_values, _ = train(world, NnqlConfig(n_episodes=250, seed=8, motion_std_m=0.5), lambda _: None)
     assert not np.array_equal(q_values, other_q_values)
 
@@ -130,14 +129,11 @@ def test_no_episodes_teach_nothing():
     world = random_world(config)
     q_values, curve = train(world, config, lambda _: None)
     assert np.array_equal(q_values, initial_q_values(80, 3, config))
-    assert curve.reward_share == ()
-    assert curve.greedy_reward_share == curve.random_reward_share
+    assert (curve.reward_share, curve.greedy_reward_share) == ((), curve.random_reward_share)
 
 
 def test_an_episode_ends_with_the_route():
-    config = NnqlConfig(n_episodes=1)
-    world = random_world(config)
-    walk = Walk(world, np.array([77, 10]))
+    walk = Walk(random_world(NnqlConfig(n_episodes=1)), np.array([77, 10]))
     assert walk.allowed.tolist() == [[True, True, False], [True, True, True]]
     walk.step(np.array([1, 2]))
     assert walk.frames.tolist() == [79, 13]
@@ -147,11 +143,9 @@ def test_an_episode_ends_with_the_route():
 
 
 def test_starts_leave_room_for_a_whole_episode_where_there_is_any():
-    world = random_world(NnqlConfig(n_episodes=1))
-    assert world.start_frames.max() == 49
-    long = random_world(NnqlConfig(n_episodes=1, n_actions_per_episode=100))
-    assert long.start_frames.max() == 79
-    assert random_world(NnqlConfig(n_episodes=1), closed=True).start_frames.max() == 79
+    for n_actions, closed, last_start in ((10, False, 49), (100, False, 79), (10, True, 79)):
+        config = NnqlConfig(n_episodes=1, n_actions_per_episode=n_actions)
+        assert random_world(config, closed).start_frames.max() == last_start
 
 
 def telling_world(config: NnqlConfig) -> TrainingWorld:
