@@ -1,8 +1,10 @@
-"""A catalog in an empty data directory, and small maps."""
+"""A catalog in an empty data directory, small maps and drives, and acts that begin at one moment."""
 
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -10,8 +12,26 @@ import pytest
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.map_file import seal, write_map
+from deepsimbad.store.records import MapRecord
 
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
+MakeMap = Callable[..., Map]
+MakeFrames = Callable[..., Drive]
+AddMap = Callable[..., MapRecord]
+Answer = TypeVar("Answer")
+
+
+def at_once(acts: Sequence[Callable[[], Answer]]) -> list[Answer]:
+    """What acts return that all begin at one moment, each in a thread of its own; raises what one of them raises."""
+    start = threading.Barrier(len(acts))
+
+    def run(act: Callable[[], Answer]) -> Answer:
+        start.wait()
+        return act()
+
+    with ThreadPoolExecutor(len(acts)) as threads:
+        return list(threads.map(run, acts))
 
 
 @pytest.fixture
@@ -27,7 +47,7 @@ def campus(catalog: Catalog) -> Catalog:
 
 
 @pytest.fixture(scope="session")
-def make_map() -> Callable[..., Map]:
+def make_map() -> MakeMap:
     def make(n: int = 60, r: int = 20, h: int = 4, seed: int = 0, **changes: Any) -> Map:
         generator = np.random.default_rng(seed)
         lists = np.argsort(generator.random((n, r)), axis=1)[:, :h].T.astype(np.uint16).copy()
@@ -55,7 +75,19 @@ def make_map() -> Callable[..., Map]:
 
 
 @pytest.fixture(scope="session")
-def make_frames() -> Callable[..., Drive]:
+def add_map(make_map: MakeMap) -> AddMap:
+    def add(catalog: Catalog, domain: str = "campus", seed: int = 0) -> MapRecord:
+        version = catalog.begin_map(domain, {"seed": seed})
+        building = catalog.building_path(domain, version)
+        write_map(building, make_map(version=version, seed=seed, domain=domain))
+        digest, n_bytes = seal(building, catalog.map_path(domain, version))
+        return catalog.seal_map(domain, version, digest, n_bytes, {"anr": 4.25})
+
+    return add
+
+
+@pytest.fixture(scope="session")
+def make_frames() -> MakeFrames:
     def make(index: list[int] | np.ndarray, dim: int = 8, seed: int = 0) -> Drive:
         index = np.asarray(index)
         generator = np.random.default_rng(seed)

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepsimbad.core.drive import Drive
-from deepsimbad.core.map import Map
 from deepsimbad.errors import (
     CancelledError,
     ConflictError,
@@ -31,12 +29,11 @@ from deepsimbad.store.backup import Inspection, back_up, inspect, migrations_of,
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.durable import service_lock
-from deepsimbad.store.map_file import read_map, seal, verify, write_map
+from deepsimbad.store.map_file import read_map, verify
 from deepsimbad.store.sessions import ObservedRow, SessionRecord, SessionStore
 from deepsimbad.store.traverses import Traverse
 
-MakeMap = Callable[..., Map]
-MakeFrames = Callable[..., Drive]
+from .conftest import AddMap, MakeFrames
 
 
 def silent(_: float) -> None:
@@ -53,23 +50,15 @@ def altered(path: Path, *statements: str) -> None:
             connection.execute(statement)
 
 
-def add_map(catalog: Catalog, make_map: MakeMap, domain: str = "campus") -> int:
-    version = catalog.begin_map(domain, {})
-    write_map(catalog.building_path(domain, version), make_map(version=version, seed=version, domain=domain))
-    digest, n_bytes = seal(catalog.building_path(domain, version), catalog.map_path(domain, version))
-    catalog.seal_map(domain, version, digest, n_bytes, {})
-    return version
-
-
 @pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory, make_map: MakeMap, make_frames: MakeFrames) -> Path:
+def original(tmp_path_factory: pytest.TempPathFactory, add_map: AddMap, make_frames: MakeFrames) -> Path:
     """Two maps, one active, one being built; two traverses; an empty domain; a session. A backup of it beside it."""
     data_dir = tmp_path_factory.mktemp("original") / "data"
     with Catalog.open(data_dir) as catalog, SessionStore.open(data_dir) as store:
         for name in ("campus", "empty"):
             catalog.create_domain(name, {}, False, [1, 2, 3])
-        for _ in range(2):
-            add_map(catalog, make_map)
+        for seed in range(2):
+            add_map(catalog, seed=seed)
         catalog.activate("campus", 1, ANY)
         catalog.activate("campus", 2, 1)
         catalog.building_path("campus", catalog.begin_map("campus", {})).write_bytes(b"half")

@@ -6,7 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack, suppress
 from datetime import datetime, timedelta
+from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,7 @@ from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.records import JobState, KeyScope, MapState, current_moment
 from deepsimbad.store.traverses import Traverse
 
-EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
+from .conftest import EVALUATOR, at_once
 
 
 def sealed(catalog: Catalog, domain: str = "campus") -> int:
@@ -149,28 +152,16 @@ def test_which_map_served_last_is_known_though_the_clock_was_set_back(
 
 
 def test_of_many_swaps_at_once_one_wins(campus: Catalog) -> None:
+    def wins(catalog: Catalog, version: int) -> bool:
+        with suppress(LostActivationError):
+            return catalog.activate("campus", version, None).version == version
+        return False
+
     versions = [sealed(campus) for _ in range(8)]
-    won: list[int] = []
-    lost: list[LostActivationError] = []
-    start = threading.Barrier(len(versions))
-
-    def swap(version: int) -> None:
-        with Catalog.open(campus.data_dir) as catalog:  # a connection of its own, as another process has
-            start.wait()
-            try:
-                catalog.activate("campus", version, None)
-                won.append(version)
-            except LostActivationError as error:
-                lost.append(error)
-
-    threads = [threading.Thread(target=swap, args=[version]) for version in versions]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(won) == 1
-    assert len(lost) == len(versions) - 1
-    assert campus.domain("campus").active_version == won[0]
+    with ExitStack() as stack:  # a connection each, as other processes have
+        catalogs = [stack.enter_context(Catalog.open(campus.data_dir)) for _ in versions]
+        won = at_once([partial(wins, *pair) for pair in zip(catalogs, versions, strict=True)])
+    assert list(compress(versions, won)) == [campus.domain("campus").active_version]
 
 
 def test_the_life_of_a_job(campus: Catalog) -> None:

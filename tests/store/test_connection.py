@@ -6,7 +6,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,8 @@ from deepsimbad.store.connection import OpenFile, open_database, open_working_fi
 from deepsimbad.store.durable import service_lock, storage_faults
 from deepsimbad_migrations.catalog.migrations import migrations as catalog_migrations
 from deepsimbad_migrations.traverse.migrations import migrations as traverse_migrations
+
+from .conftest import at_once
 
 
 @pytest.fixture
@@ -115,22 +116,7 @@ def test_what_the_system_says_is_named(number: int, reason: str, tmp_path: Path)
 
 
 def test_a_file_that_is_made_by_many_at_once_is_whole(tmp_path: Path) -> None:
-    failures: list[BaseException] = []
-    start = threading.Barrier(4)
-
-    def run() -> None:
-        try:
-            start.wait()
-            open_working_file(tmp_path / "a.sqlite", catalog_migrations, create=True).close()
-        except BaseException as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=run) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
+    at_once(4 * [lambda: open_working_file(tmp_path / "a.sqlite", catalog_migrations, create=True).close()])
 
 
 def test_a_file_of_another_kind_or_of_a_newer_release_is_refused(tmp_path: Path) -> None:

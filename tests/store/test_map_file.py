@@ -5,7 +5,6 @@ import sqlite3
 import stat
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from deepsimbad.store import arrays
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import adopt, index_bytes, read_map, seal, table_bytes, verify, write_map
 
-MakeMap = Callable[..., Map]
+from .conftest import MakeMap
 
 
 def is_equal(left: Map, right: Map) -> bool:

@@ -2,8 +2,9 @@
 
 import shutil
 import sys
-import threading
 from collections.abc import Iterator
+from functools import partial
+from itertools import compress
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,9 @@ import pytest
 from deepsimbad.errors import MissingPackageError, SettingsError, UnavailableError
 from deepsimbad.store import objects as objects_module
 from deepsimbad.store.objects import Objects
-from tests.store.bucket import Bucket, served_bucket
+
+from .bucket import Bucket, served_bucket
+from .conftest import at_once
 
 
 @pytest.fixture
@@ -63,19 +66,9 @@ def test_what_was_written_in_a_folder_outlives_a_power_cut(tmp_path: Path, monke
 
 
 def test_of_many_who_create_an_object_at_once_one_does(objects: Objects) -> None:
-    start, wrote = threading.Barrier(8), []
-
-    def create(content: bytes) -> None:
-        start.wait()
-        if objects.create("log/1", content):
-            wrote.append(content)
-
-    threads = [threading.Thread(target=create, args=[b"%d" % number]) for number in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrote == [objects.get("log/1")]
+    contents = [b"%d" % number for number in range(8)]
+    is_written = at_once([partial(objects.create, "log/1", content) for content in contents])
+    assert list(compress(contents, is_written)) == [objects.get("log/1")]
 
 
 def test_a_bucket_that_is_gone_and_credentials_that_are_refused_are_named(

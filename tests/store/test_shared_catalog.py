@@ -4,15 +4,14 @@ import gzip
 import json
 import os
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from deepsimbad.core.map import Map
 from deepsimbad.errors import (
     ConflictError,
     DamagedMapError,
@@ -28,12 +27,13 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.layout import domains_folder, map_path
 from deepsimbad.store.map_file import read_map, seal, write_map
-from deepsimbad.store.records import MapRecord, MapState
+from deepsimbad.store.records import MapState
 from deepsimbad.store.shared_catalog import SharedCatalog, inspect_objects, open_catalog
 from deepsimbad.store.traverses import Traverse
-from tests.store.bucket import served_bucket
 
-MakeMap = Callable[..., Map]
+from .bucket import served_bucket
+from .conftest import AddMap, MakeMap, at_once
+
 MakeNode = Callable[..., SharedCatalog]
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 
@@ -68,19 +68,7 @@ def node(store: tuple[str, Path], tmp_path: Path) -> Iterator[MakeNode]:
 
 
 @pytest.fixture
-def add_map(make_map: MakeMap) -> Callable[..., MapRecord]:
-    def add(catalog: Catalog, domain: str = "campus", seed: int = 0, n: int = 60) -> MapRecord:
-        version = catalog.begin_map(domain, {"seed": seed})
-        building = catalog.building_path(domain, version)
-        write_map(building, make_map(n=n, version=version, seed=seed, domain=domain))
-        digest, n_bytes = seal(building, catalog.map_path(domain, version))
-        return catalog.seal_map(domain, version, digest, n_bytes, {"anr": 4.25})
-
-    return add
-
-
-@pytest.fixture
-def pair(node: MakeNode, add_map: Callable[..., MapRecord]) -> tuple[SharedCatalog, SharedCatalog]:
+def pair(node: MakeNode, add_map: AddMap) -> tuple[SharedCatalog, SharedCatalog]:
     """Two nodes; the first has made a map that serves, and the second has heard of it."""
     node_a, node_b = node("here"), node("there")
     make_domain(node_a)
@@ -95,7 +83,7 @@ def make_domain(catalog: Catalog, name: str = "campus", **changes: Any) -> None:
 
 
 def test_domains_and_what_serves_appear_at_others_and_files_are_fetched_by_need(
-    node: MakeNode, add_map: Callable[..., MapRecord]
+    node: MakeNode, add_map: AddMap
 ) -> None:
     node_a, node_b = node("here"), node("there")
     make_domain(node_a)
@@ -167,27 +155,21 @@ def test_a_data_directory_keeps_the_number_of_who_administers_it(node: MakeNode,
     assert [node_a.administrator_of(name) for name in ("city", "port")] == [3, 1]
 
 
-def test_of_two_activations_at_once_one_is_lost(node: MakeNode, add_map: Callable[..., MapRecord]) -> None:
+def test_of_two_activations_at_once_one_is_lost(node: MakeNode, add_map: AddMap) -> None:
     node_a, node_b = node("here"), node("there")
     make_domain(node_a)
     for seed in range(3):
         add_map(node_a, seed=seed)
         node_a.activate("campus", seed + 1, ANY)
     node_b.follow()
-    start, outcomes = threading.Barrier(2), []
 
-    def activate(catalog: Catalog, version: int) -> None:
-        start.wait()
+    def active_after(catalog: Catalog, version: int) -> object:
         try:
-            outcomes.append(catalog.activate("campus", version, 3).version)
+            return catalog.activate("campus", version, 3).version
         except LostActivationError as error:
-            outcomes.append(error.hints["active"])
+            return error.hints["active"]
 
-    threads = [threading.Thread(target=activate, args=arguments) for arguments in ((node_a, 1), (node_b, 2))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    outcomes = at_once([partial(active_after, node_a, 1), partial(active_after, node_b, 2)])
     node_a.follow()
     node_b.follow()
     winner = node_a.domain("campus").active_version
@@ -196,9 +178,7 @@ def test_of_two_activations_at_once_one_is_lost(node: MakeNode, add_map: Callabl
     assert node_b.domain("campus").active_version == winner
 
 
-def test_a_number_that_two_nodes_gave_belongs_to_who_published_first(
-    node: MakeNode, add_map: Callable[..., MapRecord]
-) -> None:
+def test_a_number_that_two_nodes_gave_belongs_to_who_published_first(node: MakeNode, add_map: AddMap) -> None:
     node_a, node_b = node("here"), node("there")
     make_domain(node_a)
     node_b.follow()
@@ -224,7 +204,7 @@ def test_a_number_that_two_nodes_gave_belongs_to_who_published_first(
 
 
 def test_a_version_being_built_whose_number_was_published_is_given_up(
-    node: MakeNode, add_map: Callable[..., MapRecord], make_map: MakeMap
+    node: MakeNode, add_map: AddMap, make_map: MakeMap
 ) -> None:
     node_a, node_b = node("here"), node("there")
     make_domain(node_a)
@@ -241,7 +221,7 @@ def test_a_version_being_built_whose_number_was_published_is_given_up(
 
 
 def test_a_data_directory_with_domains_publishes_them_when_it_begins_to_follow(
-    node: MakeNode, add_map: Callable[..., MapRecord], tmp_path: Path, store: tuple[str, Path]
+    node: MakeNode, add_map: AddMap, tmp_path: Path, store: tuple[str, Path]
 ) -> None:
     with Catalog.open(tmp_path / "old") as old:
         make_domain(old)
@@ -267,7 +247,7 @@ def test_a_data_directory_with_domains_publishes_them_when_it_begins_to_follow(
 
 
 def test_a_new_node_begins_with_all_domains_in_one_object(
-    node: MakeNode, add_map: Callable[..., MapRecord], store: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
+    node: MakeNode, add_map: AddMap, store: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shared_catalog, "_LEAST_BETWEEN_STATES", 4)
     node_a = node("here")
@@ -300,7 +280,7 @@ def test_a_new_node_begins_with_all_domains_in_one_object(
 
 @pytest.mark.parametrize("step", ["put_map", "append", "_apply"])
 def test_a_crash_between_two_steps_is_mended_by_the_next_look(
-    node: MakeNode, add_map: Callable[..., MapRecord], monkeypatch: pytest.MonkeyPatch, step: str
+    node: MakeNode, add_map: AddMap, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     node_a, node_b = node("here"), node("there")
     make_domain(node_a)
@@ -340,7 +320,7 @@ def test_a_domain_whose_creation_was_cut_short_is_published_at_the_next_start(no
 
 
 def test_a_change_that_cannot_be_published_is_not_made(
-    node: MakeNode, add_map: Callable[..., MapRecord], store: tuple[str, Path]
+    node: MakeNode, add_map: AddMap, store: tuple[str, Path]
 ) -> None:
     node_a = node("here")
     make_domain(node_a)
@@ -397,15 +377,11 @@ def test_a_file_is_fetched_once_however_many_ask(
     _, node_b = pair
     n_fetched, pieces = [], map_store.MapStore.map_pieces
     monkeypatch.setattr(map_store.MapStore, "map_pieces", lambda *arguments: n_fetched.append(1) or pieces(*arguments))
-    threads = [threading.Thread(target=node_b.map_file, args=("campus", 1)) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(8 * [partial(node_b.map_file, "campus", 1)])
     assert len(n_fetched) == 1
 
 
-def test_the_cache_holds_its_size_and_keeps_what_is_in_use(node: MakeNode, add_map: Callable[..., MapRecord]) -> None:
+def test_the_cache_holds_its_size_and_keeps_what_is_in_use(node: MakeNode, add_map: AddMap) -> None:
     node_a = node("here")
     make_domain(node_a)
     sizes = []

@@ -1,5 +1,5 @@
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from deepsimbad.store import traverses
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.traverses import Traverse
 
-MakeFrames = Callable[..., Drive]
+from .conftest import MakeFrames
 
 
 @pytest.fixture

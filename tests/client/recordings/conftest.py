@@ -5,6 +5,16 @@ import numpy as np
 import pytest
 
 
+def pixels_of(encoded):
+    """What an image that is sent shows, [height, width, 3] uint8, BGR."""
+    return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
+
+
+def empty_files(folder, names):
+    for name in names:
+        (folder / name).write_bytes(b"")
+
+
 class NcltTree:
     """Writes one date of NCLT under `root`."""
 

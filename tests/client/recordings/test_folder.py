@@ -9,6 +9,8 @@ from deepsimbad_client.errors import BrokenFrameError, InvalidArgumentError, Sou
 from deepsimbad_client.recordings import LeftOut
 from deepsimbad_client.recordings.sources import open_source
 
+from .conftest import empty_files, pixels_of
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -24,14 +26,14 @@ def positions(folder, *lines):
 
 
 def places_of(folder):
-    return [(frame.name, frame.position_m) for frame in open_source(str(folder)).frames]
+    return {frame.name: frame.position_m for frame in open_source(str(folder)).frames}
 
 
 def test_the_table_is_found_in_any_letter_case(folder):
     (folder / "Positions.CSV").write_text("position_m\n0\n1\n2\n3\n")
-    assert [position_m for _, position_m in places_of(folder)] == [0, 1, 2, 3]
+    assert list(places_of(folder).values()) == [0, 1, 2, 3]
     positions(folder, "position_m", "0", "2", "4", "6")
-    assert [position_m for _, position_m in places_of(folder)] == [0, 2, 4, 6]
+    assert list(places_of(folder).values()) == [0, 2, 4, 6]
 
 
 def test_images_come_in_name_order_evenly_spaced(folder):
@@ -59,12 +61,16 @@ def test_images_come_in_name_order_evenly_spaced(folder):
         ["#name, position_m", "11.png,9", "8.png,0", "10.png,4", "9.png,1.5"],
         ["image,route_position_m", "summer/8.png,0", "summer/9.png,1.5", "summer/10.png,4", "summer/11.png,9"],
         ["name;position_m", "8.png;0", "9.png;1.5", "10.png;4", "11.png;9"],
-        ["\ufeffposition_m", "", "0", "1.5", "", "4", "9"],
+        ["position_m", "", "0", "1.5", "", "4", "9"],
+        ["position_m\r", "0\r", "1.5\r", "4\r", "9\r"],
+        ["position_m;x_m", "0,0;1", "1,5;2", "4;2", "9,0;2"],
+        ["name,position_m", "Images\\8.PNG,0", "Images\\9.PNG,1.5", "Images\\10.PNG,4", "Images\\11.PNG,9"],
     ],
 )
 def test_positions_are_read_in_every_documented_form(folder, lines):
-    (folder / "positions.csv").write_text("\n".join(lines), encoding="utf-8")
-    assert places_of(folder) == [("8.png", 0.0), ("9.png", 1.5), ("10.png", 4.0), ("11.png", 9.0)]
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        (folder / "positions.csv").write_bytes("\n".join(lines).encode(encoding))
+        assert places_of(folder) == {"8.png": 0.0, "9.png": 1.5, "10.png": 4.0, "11.png": 9.0}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +78,7 @@ def test_positions_are_read_in_every_documented_form(folder, lines):
 )
 def test_ground_coordinates_alone_give_the_distance_along_them(folder, lines):
     positions(folder, *lines)
-    assert places_of(folder) == [("8.png", 0.0), ("9.png", 5.0), ("10.png", 15.0), ("11.png", 16.0)]
+    assert places_of(folder) == {"8.png": 0.0, "9.png": 5.0, "10.png": 15.0, "11.png": 16.0}
     frame = open_source(str(folder)).frames[1]
     assert (frame.x_m, frame.y_m) == (3.0, 4.0)
 
@@ -93,14 +99,15 @@ def test_unlisted_images_and_lines_without_an_image_are_counted(folder):
 
 
 def test_a_misspelt_name_is_one_frame_left_out_named_on_each_side(tmp_path):
-    for number in range(21):
-        (tmp_path / f"{number}.png").write_bytes(b"")
-    positions(tmp_path, "name,position_m", *(f"{number}{'x' * (number == 7)}.png,{number}" for number in range(21)))
+    def misspell(*misspelt):
+        rows = (f"{number}{'x' * (number in misspelt)}.png,{number}" for number in range(21))
+        positions(tmp_path, "name,position_m", *rows)
+
+    empty_files(tmp_path, (f"{number}.png" for number in range(21)))
+    misspell(7)
     sides = {"not in positions.csv": ["7.png"], "in positions.csv without an image": ["7x.png"]}
     assert LeftOut(open_source(str(tmp_path)), allow_missing=False).names == sides
-    positions(
-        tmp_path, "name,position_m", *(f"{number}{'x' * (number in (7, 8))}.png,{number}" for number in range(21))
-    )
+    misspell(7, 8)
     with pytest.raises(TooManyLeftOutError, match="10% of the frames"):
         LeftOut(open_source(str(tmp_path)), allow_missing=False)
 
@@ -135,6 +142,10 @@ def test_a_misspelt_name_is_one_frame_left_out_named_on_each_side(tmp_path):
         (["index,position_m", "1,0", "2,1", "3,2", "4,3"], r"counts from 1 to 4: count from 0"),
         (["lat,lon", *["148,11"] * 4], r"latitude 148, longitude 11 is no place in degrees.*changed over"),
         (["position_m", "1e308", "1e308", "-2e9", "3.4e38"], r"none of 4 frames has a position"),
+        *(
+            (["position_m,timestamp_s", "0,1", "1,2", f"2,{time}", "3,4"], "line 4")
+            for time in ("Infinity", "sNaN", "1e400", "1e17")
+        ),
     ],
 )
 def test_positions_that_make_no_sense_are_refused_with_their_line(folder, lines, message):
@@ -146,27 +157,17 @@ def test_positions_that_make_no_sense_are_refused_with_their_line(folder, lines,
 def test_a_frame_without_a_place_is_left_out_by_name(folder):
     positions(folder, "name,position_m", "8.png,0", "9.png,-1e308", "10.png,nan", "11.png,4")
     recording = open_source(str(folder))
-    assert [(frame.index, frame.name, frame.position_m) for frame in recording.frames] == [
-        (0, "8.png", 0.0),
-        (1, "11.png", 4.0),
-    ]
+    assert [frame.index for frame in recording.frames] == [0, 1]
+    assert places_of(folder) == {"8.png": 0.0, "11.png": 4.0}
     assert recording.left_out_names == {"without a position": ["9.png", "10.png"]}
-
-
-def test_a_path_written_on_windows_finds_its_file(folder):
-    positions(folder, "name,position_m", *(f"Images\\{n}.PNG,{n}" for n in (8, 9, 10, 11)))
-    assert places_of(folder) == [("8.png", 8), ("9.png", 9), ("10.png", 10), ("11.png", 11)]
 
 
 def test_falling_positions_are_reversed_when_asked_for(folder):
     positions(folder, "position_m", "3.5", "2", "2.01", "0")
-    recording = open_source(str(folder), reverse=True)
-    assert [(frame.index, frame.name, frame.position_m) for frame in recording.frames] == [
-        (0, "11.png", 0.0),
-        (1, "10.png", 2.0),
-        (2, "9.png", 2.0),
-        (3, "8.png", 3.5),
-    ]
+    frames = open_source(str(folder), reverse=True).frames
+    assert [frame.index for frame in frames] == [0, 1, 2, 3]
+    assert [frame.name for frame in frames] == ["11.png", "10.png", "9.png", "8.png"]
+    assert [frame.position_m for frame in frames] == [0.0, 2.0, 2.0, 3.5]
     (folder / "positions.csv").unlink()
     assert [frame.position_m for frame in open_source(str(folder), reverse=True, spacing_m=2).frames] == [0, 2, 4, 6]
 
@@ -178,11 +179,8 @@ def test_falling_positions_are_reversed_when_asked_for(folder):
 def test_units_of_times_are_told_by_their_magnitude(folder, column, unit_us):
     at_us = [1_400_000_000_000_000 + 100_000 * place for place in range(4)]
     times = [f"{time_us // unit_us if unit_us >= 1 else time_us * 1000:.0f}" for time_us in at_us]
-    positions(
-        folder,
-        f"name,position_m,{column}",
-        *(f"{n}.png,{n},{time}" for n, time in zip(range(8, 12), times, strict=True)),
-    )
+    rows = (f"{n}.png,{n},{time}" for n, time in zip(range(8, 12), times, strict=True))
+    positions(folder, f"name,position_m,{column}", *rows)
     if unit_us == 1_000_000:
         at_us = [at_us[0]] * 4
     recording = open_source(str(folder))
@@ -193,7 +191,7 @@ def test_units_of_times_are_told_by_their_magnitude(folder, column, unit_us):
 def test_times_say_how_far_and_in_which_order(folder):
     header = "name,x_m,y_m,timestamp_s"
     positions(folder, header, "8.png,30,0,3", "9.png,0,0,0", "10.png,10,0,1", "11.png,20,0,2")
-    assert places_of(folder) == [("9.png", 0), ("10.png", 10), ("11.png", 20), ("8.png", 30)]
+    assert list(places_of(folder).items()) == [("9.png", 0), ("10.png", 10), ("11.png", 20), ("8.png", 30)]
     assert "order of their times" in open_source(str(folder)).remarks[0]
     positions(folder, header, "8.png,0,0,0", "9.png,10,0,1", "10.png,5735000,619000,2", "11.png,20,0,3")
     recording = open_source(str(folder))
@@ -205,13 +203,12 @@ def test_times_say_how_far_and_in_which_order(folder):
 @pytest.mark.parametrize("column", ["x_m,y_m", "position_m"])
 @pytest.mark.parametrize("ahead", [range(10, 20), range(10), range(12, 14)])
 def test_a_clock_set_on_the_way_leaves_frames_in_the_order_of_names(tmp_path, column, ahead):
-    for number in range(30):
-        (tmp_path / f"{number}.png").write_bytes(b"")
+    empty_files(tmp_path, (f"{number}.png" for number in range(30)))
     y = ",0" * (column == "x_m,y_m")
     rows = (f"{number}{y},{1_700_000_000 + number + 3600 * (number in ahead)}" for number in range(30))
     positions(tmp_path, f"{column},timestamp_s", *rows)
     recording = open_source(str(tmp_path))
-    assert places_of(tmp_path) == [(f"{number}.png", number) for number in range(30)]
+    assert list(places_of(tmp_path).items()) == [(f"{number}.png", number) for number in range(30)]
     assert {frame.timestamp_us for frame in recording.frames} == {None}
     next_row = ahead[-1] + 1
     (remark,) = recording.remarks
@@ -220,8 +217,7 @@ def test_a_clock_set_on_the_way_leaves_frames_in_the_order_of_names(tmp_path, co
 
 
 def test_two_drives_by_turns_are_refused_by_name_and_noise_is_not(tmp_path):
-    for number in range(60):
-        (tmp_path / f"{number}.png").write_bytes(b"")
+    empty_files(tmp_path, (f"{number}.png" for number in range(60)))
     rng = np.random.default_rng(2)
     for turns in (np.arange(60) % 2, rng.integers(0, 2, 60)):
         positions(tmp_path, "x_m,y_m", *(f"{number},{20 * turn}" for number, turn in enumerate(turns)))
@@ -243,8 +239,7 @@ def test_two_drives_by_turns_are_refused_by_name_and_noise_is_not(tmp_path):
 
 
 def test_one_wrong_time_among_many_is_left_out_by_name(tmp_path):
-    for number in range(40):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((4, 4), np.uint8))
+    empty_files(tmp_path, (f"{number}.png" for number in range(40)))
     positions(tmp_path, "x_m,y_m,time_s", *(f"{number},0,{number + 1000 * (number == 20)}" for number in range(40)))
     recording = open_source(str(tmp_path))
     assert recording.left_out_names == {"whose time goes back": ["20.png"]}
@@ -252,8 +247,7 @@ def test_one_wrong_time_among_many_is_left_out_by_name(tmp_path):
 
 
 def test_lines_at_a_rate_of_their_own_are_interpolated_at_the_times_that_names_tell(tmp_path):
-    for time in ("1305031103.05", "1305031103.5", "1305031109.9"):
-        cv2.imwrite(str(tmp_path / f"{time}.png"), np.zeros((4, 4), np.uint8))
+    empty_files(tmp_path, ("1305031103.05.png", "1305031103.5.png", "1305031109.9.png"))
     rows = (f"{1_305_031_103_000 + 100 * k},{k},7" for k in range(11))
     positions(tmp_path, "timestamp,x_m,y_m", *rows)
     recording = open_source(str(tmp_path))
@@ -263,14 +257,9 @@ def test_lines_at_a_rate_of_their_own_are_interpolated_at_the_times_that_names_t
 
 
 def test_clocks_that_differ_are_told(tmp_path):
-    times = range(1_305_031_103, 1_305_031_106)
-    for number in times:
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((4, 4), np.uint8))
-    positions(
-        tmp_path,
-        "name,position_m,time",
-        *(f"{1_305_031_103 + number},{number},{1_305_034_703 + 1.5 * number}" for number in range(3)),
-    )
+    empty_files(tmp_path, (f"{time}.png" for time in range(1_305_031_103, 1_305_031_106)))
+    rows = (f"{1_305_031_103 + number},{number},{1_305_034_703 + 1.5 * number}" for number in range(3))
+    positions(tmp_path, "name,position_m,time", *rows)
     (_, remark) = open_source(str(tmp_path)).remarks
     assert "by +3600.000 s at the first frame and +3601.000 s at the last" in remark
 
@@ -285,7 +274,7 @@ def test_a_small_image_goes_as_it_is_and_a_larger_one_resized_where_that_is_shor
     for input_size in ((9, 12), (12, 9), (4, 4)):
         encoded = recording.image(frame, input_size)
         assert encoded.content_type == "image/png"
-        image = cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
+        image = pixels_of(encoded)
         assert (image.shape[1], image.shape[0]) == input_size
         assert abs(float(image.mean()) - 8) < 2
 
@@ -296,15 +285,14 @@ def test_a_format_nobody_posts_goes_as_png_without_loss(tmp_path):
     recording = open_source(str(tmp_path))
     encoded = recording.image(recording.frames[0], None)
     assert encoded.content_type == "image/png"
-    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR), image)
+    np.testing.assert_array_equal(pixels_of(encoded), image)
 
 
 def test_images_of_several_shapes_are_told_by_number_and_name(folder):
     cv2.imwrite(str(folder / "9.png"), np.zeros((16, 12, 3), np.uint8))
     (folder / "10.png").write_bytes(b"no image")
-    remarks = [remark for remark in open_source(str(folder)).remarks if "not of one kind" in remark]
-    assert len(remarks) == 1
-    assert "2 of 16 x 12 (8.png, 11.png), 1 of 12 x 16 (9.png);" in remarks[0]
+    (remark,) = [remark for remark in open_source(str(folder)).remarks if "not of one kind" in remark]
+    assert "2 of 16 x 12 (8.png, 11.png), 1 of 12 x 16 (9.png);" in remark
 
 
 def test_cameras_that_exif_names_and_pictures_that_it_turns(tmp_path):
@@ -345,14 +333,11 @@ def test_images_of_a_format_that_is_not_read_are_left_out_by_name(folder):
             open_source(source)
 
 
-def test_what_spreadsheets_write_is_read_or_how_to_save_it_is_said(folder):
-    table = folder / "positions.csv"
-    table.write_text("position_m\n0\n1\n2\n3\n", encoding="utf-16")
-    assert [position_m for _, position_m in places_of(folder)] == [0, 1, 2, 3]
-    for body in ("position_m\n0\n".encode("utf-16-le"), "name,position_m\nstraße,0\n".encode("latin-1")):
-        table.write_bytes(body)
-        with pytest.raises(SourceError, match="save it as CSV in UTF-8"):
-            open_source(str(folder))
+@pytest.mark.parametrize(("text", "encoding"), [("position_m\n0\n", "utf-16-le"), ("name,x_m\nstraße,0", "latin-1")])
+def test_how_to_save_what_spreadsheets_write_is_said(folder, text, encoding):
+    (folder / "positions.csv").write_text(text, encoding=encoding)
+    with pytest.raises(SourceError, match="save it as CSV in UTF-8"):
+        open_source(str(folder))
 
 
 def test_a_folder_without_images_says_what_it_looked_for(tmp_path):
@@ -361,13 +346,6 @@ def test_a_folder_without_images_says_what_it_looked_for(tmp_path):
     (tmp_path / "lb3").mkdir()
     with pytest.raises(SourceError, match=f"for NCLT write nclt:{tmp_path}"):
         open_source(str(tmp_path))
-
-
-@pytest.mark.parametrize("time", ["Infinity", "sNaN", "1e400", "1e17"])
-def test_a_number_that_is_no_time_is_named(folder, time):
-    positions(folder, "position_m,timestamp_s", "0,1", "1,2", f"2,{time}", "3,4")
-    with pytest.raises(SourceError, match=r"line 4"):
-        open_source(str(folder))
 
 
 def test_degrees_in_the_columns_of_metres_are_told(folder):
@@ -389,13 +367,6 @@ def test_positions_that_all_are_one_and_tables_of_another_name_are_told(folder):
     assert open_source(str(folder)).remarks[-1] == "folders inside are not looked at, and rear holds images"
 
 
-def test_decimal_commas_between_semicolons_are_read(folder):
-    (folder / "positions.csv").write_bytes(b"\xef\xbb\xbf" + b"position_m\r\n0\r\n1\r\n2\r\n3\r\n")
-    assert [position_m for _, position_m in places_of(folder)] == [0, 1, 2, 3]
-    positions(folder, "position_m;x_m", "0,25;1", "1,5;2", "2,75;2", "3;2")
-    assert [position_m for _, position_m in places_of(folder)] == [0.25, 1.5, 2.75, 3]
-
-
 @pytest.mark.parametrize("offset_s", [float("nan"), 1e30])
 def test_an_offset_that_is_none_is_refused(folder, offset_s):
     with pytest.raises(InvalidArgumentError, match="clocks are not so far apart"):
@@ -403,8 +374,7 @@ def test_an_offset_that_is_none_is_refused(folder, offset_s):
 
 
 def test_a_clock_coarser_than_the_frames_leaves_each_its_place(tmp_path):
-    for number in range(40):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((4, 4), np.uint8))
+    empty_files(tmp_path, (f"{number}.png" for number in range(40)))
     positions(tmp_path, "time_s,x_m,y_m", *(f"{1_400_000_000 + number // 5},{number},0" for number in range(40)))
     recording = open_source(str(tmp_path))
     assert [frame.position_m for frame in recording.frames] == pytest.approx(range(40))
@@ -412,8 +382,7 @@ def test_a_clock_coarser_than_the_frames_leaves_each_its_place(tmp_path):
 
 
 def test_one_missing_time_leaves_the_others_in_use(tmp_path):
-    for number in range(40):
-        (tmp_path / f"{number:02d}.png").write_bytes(b"")
+    empty_files(tmp_path, (f"{number:02d}.png" for number in range(40)))
     rng = np.random.default_rng(3)
     rows = [
         [f"{k:02d}.png", f"{k + rng.normal(0, 0.02):.3f}", "0", str(1_700_000_000_000_000 + k * 100_000)]
