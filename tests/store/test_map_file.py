@@ -5,6 +5,7 @@ import sqlite3
 import stat
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,6 +37,19 @@ def is_equal(left: Map, right: Map) -> bool:
         if array.dtype != right_arrays[name].dtype or not is_alike:
             return False
     return True
+
+
+@pytest.fixture
+def path(make_map: MakeMap, tmp_path: Path) -> Path:
+    """A map that was written and not yet sealed."""
+    write_map(tmp_path / "map", make_map())
+    return tmp_path / "map"
+
+
+@pytest.fixture
+def final(path: Path) -> Path:
+    """Where the map lies once it is sealed."""
+    return path.with_name("000001.sqlite")
 
 
 def everything(make_map: MakeMap) -> Map:
@@ -84,9 +98,8 @@ def test_an_array_of_many_parts(make_map: MakeMap, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(arrays, "PART_BYTES", 100)
     contents = everything(make_map)
     write_map(tmp_path / "map", contents)
-    with sqlite3.connect(tmp_path / "map") as connection:
+    with closing(sqlite3.connect(tmp_path / "map")) as connection:
         (n_parts,) = connection.execute("SELECT count(*) FROM map_image_encoding").fetchone()
-    connection.close()
     assert n_parts == -(-60 * 8 * 4 // 100)
     monkeypatch.undo()
     back = read_map(tmp_path / "map")
@@ -159,19 +172,16 @@ def test_every_flipped_byte_is_seen_or_harmless(make_map: MakeMap, tmp_path: Pat
     assert n_seen > 100
 
 
-def test_files_that_are_no_maps_are_damaged_maps(make_map: MakeMap, tmp_path: Path) -> None:
-    path = tmp_path / "map"
+def test_files_that_are_no_maps_are_damaged_maps(path: Path, tmp_path: Path) -> None:
     with pytest.raises(DamagedMapError, match="missing"):
-        read_map(path)
-    write_map(path, make_map())
+        read_map(tmp_path / "nowhere")
     map_bytes = path.read_bytes()
     with Catalog.open(tmp_path / "data"):
         pass
     foreign = (tmp_path / "data/catalog.sqlite").read_bytes()
     unmarked = tmp_path / "foreign"
-    with sqlite3.connect(unmarked) as connection:
+    with closing(sqlite3.connect(unmarked)) as connection:
         connection.execute("CREATE TABLE map (id)")
-    connection.close()
     contents = [b"", b"x", b"GIF89a" * 1000, map_bytes[:99], foreign, unmarked.read_bytes()]
     contents += [map_bytes[:length] for length in range(4096, len(map_bytes), 4096)]
     for content in contents:
@@ -181,13 +191,6 @@ def test_files_that_are_no_maps_are_damaged_maps(make_map: MakeMap, tmp_path: Pa
                 continue  # page counts of a file that lost its end may still stand
             with pytest.raises(DamagedMapError):
                 read(path)
-
-
-def _alter(path: Path, *statements: str) -> None:
-    with sqlite3.connect(path) as connection:
-        for statement in statements:
-            connection.execute(statement)
-    connection.close()
 
 
 @pytest.mark.parametrize(
@@ -217,10 +220,9 @@ def _alter(path: Path, *statements: str) -> None:
         "PRAGMA journal_mode = WAL",
     ],
 )
-def test_altered_maps_are_damaged_maps(make_map: MakeMap, statement: str, tmp_path: Path) -> None:
-    path = tmp_path / "map"
-    write_map(path, make_map())
-    _alter(path, statement)
+def test_altered_maps_are_damaged_maps(path: Path, statement: str) -> None:
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute(statement)
     with pytest.raises(DamagedMapError):
         read_map(path)
 
@@ -243,35 +245,28 @@ def test_the_index_of_a_campus_fits_the_papers_size(make_map: MakeMap, tmp_path:
     assert np.array_equal(read_map(path).lists, lists)
 
 
-def test_a_sealed_map_is_whole_alone_and_read_only(make_map: MakeMap, tmp_path: Path) -> None:
-    building, final = tmp_path / "000001.building", tmp_path / "000001.sqlite"
-    write_map(building, make_map())
-    digest, n_bytes = seal(building, final)
-    assert [path.name for path in tmp_path.iterdir()] == ["000001.sqlite"]
+def test_a_sealed_map_is_whole_alone_and_read_only(path: Path, final: Path) -> None:
+    digest, n_bytes = seal(path, final)
     assert digest == hashlib.sha256(final.read_bytes()).hexdigest()
     assert n_bytes == final.stat().st_size
     assert stat.S_IMODE(final.stat().st_mode) == 0o444
     verify(final, digest)
     assert read_map(final).domain == "campus"
-    assert [path.name for path in tmp_path.iterdir()] == ["000001.sqlite"]  # reading leaves nothing beside it
+    assert list(path.parent.iterdir()) == [final], "sealing and reading leave nothing beside it"
     assert digest == hashlib.sha256(final.read_bytes()).hexdigest()
 
 
-def test_a_sealed_map_is_never_replaced(make_map: MakeMap, tmp_path: Path) -> None:
-    building, final = tmp_path / "000001.building", tmp_path / "000001.sqlite"
-    write_map(building, make_map())
-    digest, _ = seal(building, final)
-    write_map(building, make_map(seed=1))
+def test_a_sealed_map_is_never_replaced(make_map: MakeMap, path: Path, final: Path) -> None:
+    digest, _ = seal(path, final)
+    write_map(path, make_map(seed=1))
     with pytest.raises(ConflictError):
-        seal(building, final)
+        seal(path, final)
     verify(final, digest)
-    assert building.exists()
+    assert path.exists()
 
 
-def test_a_changed_file_fails_its_digest(make_map: MakeMap, tmp_path: Path) -> None:
-    write_map(tmp_path / "a", make_map())
-    final = tmp_path / "a.sqlite"
-    digest, n_bytes = seal(tmp_path / "a", final)
+def test_a_changed_file_fails_its_digest(path: Path, final: Path) -> None:
+    digest, n_bytes = seal(path, final)
     content = final.read_bytes()
     for at in range(0, n_bytes, 997):
         final.chmod(0o644)
@@ -279,8 +274,8 @@ def test_a_changed_file_fails_its_digest(make_map: MakeMap, tmp_path: Path) -> N
         with pytest.raises(DamagedMapError):
             verify(final, digest)
     with pytest.raises(DamagedMapError, match="SHA-256 differs"):
-        adopt(final, tmp_path / "b.sqlite", digest)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.sqlite"}
+        adopt(final, final.with_name("b.sqlite"), digest)
+    assert list(final.parent.iterdir()) == [final]
     final.write_bytes(content[:-1])
     with pytest.raises(DamagedMapError):
         verify(final, digest)
@@ -289,41 +284,37 @@ def test_a_changed_file_fails_its_digest(make_map: MakeMap, tmp_path: Path) -> N
         verify(final, digest)
 
 
-def test_what_cannot_be_read_back_is_not_sealed(make_map: MakeMap, tmp_path: Path) -> None:
-    building, final = tmp_path / "000001.building", tmp_path / "000001.sqlite"
+def test_what_cannot_be_read_back_is_not_sealed(make_map: MakeMap, path: Path, final: Path) -> None:
     with pytest.raises(UnavailableError):
-        seal(building, final)
-    write_map(building, make_map())
-    map_bytes = building.read_bytes()
+        seal(path.with_name("nowhere"), final)
+    map_bytes = path.read_bytes()
     damaged_at = map_bytes.index(make_map().position_m[20:40].tobytes()) + 100
     for content in (
         b"nothing of the kind" * 500,
         map_bytes[: len(map_bytes) // 2],
         map_bytes[:damaged_at] + bytes([map_bytes[damaged_at] ^ 1]) + map_bytes[damaged_at + 1 :],
     ):
-        building.write_bytes(content)
+        path.write_bytes(content)
         with pytest.raises(DamagedMapError):
-            seal(building, final)
+            seal(path, final)
         assert not final.exists()
         assert not final.with_suffix(".sealing").exists()
 
 
-def test_a_disk_that_takes_no_more_is_named_and_leaves_nothing(make_map: MakeMap, tmp_path: Path) -> None:
+def test_a_disk_that_takes_no_more_is_named_and_leaves_nothing(path: Path, final: Path) -> None:
     """The kernel's limit on file sizes stands for the full disk, in a process of its own."""
-    write_map(tmp_path / "000001.building", make_map())
     script = """
 import resource, sys
 from pathlib import Path
 from deepsimbad.errors import UnavailableError
 from deepsimbad.store.map_file import seal
-folder = Path(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, 8_000))
 try:
-    seal(folder / "000001.building", folder / "000001.sqlite")
+    seal(*map(Path, sys.argv[1:]))
 except UnavailableError as error:
     print(error.hints["reason"])
 """
-    process = subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True, capture_output=True, text=True)
+    process = subprocess.run([sys.executable, "-c", script, path, final], check=True, capture_output=True, text=True)
     assert process.stdout.strip() in ("disk_full", "io_error")
-    assert [path.name for path in tmp_path.iterdir()] == ["000001.building"]
-    seal(tmp_path / "000001.building", tmp_path / "000001.sqlite")
+    assert list(path.parent.iterdir()) == [path]
+    seal(path, final)
