@@ -26,7 +26,7 @@ class CommandResult:
         """The one line on standard error that tells a named error."""
         assert (self.code, self.out) == (1, ""), self
         (line,) = self.err.splitlines()
-        assert re.match(r"deepsimbad: [a-z_]+: ", line)
+        assert re.match(r"deepsimbad(-client)?: [a-z_]+: ", line)
         return line
 
 

@@ -1,10 +1,12 @@
 """The real service on a free port of this machine, a link to it that can lose answers, and recordings to send it."""
 
+import json
 import threading
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
 
+import cv2
 import httpx2
 import numpy as np
 import pytest
@@ -17,6 +19,8 @@ from deepsimbad_client import Client, RetryPolicy
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
+
+from ..commands import run_command
 
 ENCODINGS = {"kind": "feature_l2", "extractor": "none"}
 
@@ -71,6 +75,16 @@ def make_map(client, domain, encodings, training_episodes=0):
     remap(client, domain, "summer", landmark_traverse="landmarks", **options)
 
 
+def draw(folder, n, seed=0, form="{}.png", size=(96, 64)):
+    """Draw `n` pictures, no two of them alike, into a folder, which is returned."""
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(seed)
+    for number in range(n):
+        coarse = rng.integers(0, 255, (6, 8, 3), np.uint8)
+        cv2.imwrite(str(folder / form.format(number)), cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC))
+    return folder
+
+
 class Link(httpx2.HTTPTransport):
     """A transport to the real service; it loses the answer to every request for which `lose` returns True."""
 
@@ -105,6 +119,39 @@ def link():
 def client(route, link):
     with Client(route, retry=RetryPolicy(attempts=3), transport=link, sleep=lambda seconds: None) as client:
         yield client
+
+
+@pytest.fixture
+def command(route):
+    """Runs a command of the client, given as words, against the service."""
+
+    def command(*words):
+        return run_command(["deepsimbad-client", *words], DEEPSIMBAD_URL=route)
+
+    return command
+
+
+@pytest.fixture
+def out(command):
+    """Runs a command that succeeds, and returns its standard output, parsed where it is JSON."""
+
+    def out(*words):
+        result = command(*words)
+        assert result.code == 0, result.err
+        return json.loads(result.out) if "--json" in words else result.out
+
+    return out
+
+
+@pytest.fixture
+def ends(command):
+    """Runs a command that ends with this exit code and these words on standard error."""
+
+    def ends(code, says, *words):
+        result = command(*words)
+        assert (result.code, says in result.err) == (code, True), result
+
+    return ends
 
 
 @pytest.fixture

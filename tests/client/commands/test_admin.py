@@ -1,7 +1,6 @@
 """An administrator's commands against the real service."""
 
 import hashlib
-import json
 import re
 import sqlite3
 from contextlib import closing
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import Client, errors
-from deepsimbad_client.commands import run
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 
@@ -29,31 +27,6 @@ def domain(service, encodings, tmp_path_factory):
         for file in (encodings / "winter.npy", noise):
             upload(client, open_source(str(file)), "season", file.stem)
     return "season"
-
-
-@pytest.fixture
-def out(client, capsys, monkeypatch):
-    """Runs a command that succeeds, and returns its standard output, parsed where it is JSON."""
-    monkeypatch.setenv("DEEPSIMBAD_URL", client.url)
-
-    def printed(*command):
-        assert run(list(command)) == 0, capsys.readouterr().err
-        text = capsys.readouterr().out
-        return json.loads(text) if "--json" in command else text
-
-    return printed
-
-
-@pytest.fixture
-def refused(capsys, monkeypatch, client):
-    """Runs a command that ends with this exit code and these words on standard error."""
-    monkeypatch.setenv("DEEPSIMBAD_URL", client.url)
-
-    def refused(code, words, *command):
-        assert run(list(command)) == code
-        assert words in capsys.readouterr().err
-
-    return refused
 
 
 def test_a_worse_map_is_sealed_not_served_and_says_why(client, domain, out):
@@ -77,7 +50,7 @@ def test_a_worse_map_is_sealed_not_served_and_says_why(client, domain, out):
     assert [version["state"] for version in out("maps", domain, "--json")] == ["sealed", "sealed", "active"]
 
 
-def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(client, domain, out, refused):
+def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(client, domain, out, ends):
     command = ["remap", "--domain", domain, "--training", "summer", "--check", "winter", "--gate", "5"]
     result = out(*command, *QUICK[2:])["result"]
     version = result["map_version"]
@@ -86,13 +59,13 @@ def test_a_map_as_good_passes_its_gate_and_a_rollback_undoes_it(client, domain, 
     assert out("rollback", domain, "--json")["version"] == version
     assert out("activate", domain, "1", "--expected", str(version)) == f"{domain} serves map 1\n"
     assert client.domain(domain).map_version == 1
-    refused(1, "lost_activation", "activate", domain, str(version), "--expected", "99")
-    refused(1, "unknown_map", "activate", domain, "999")
+    ends(1, "lost_activation", "activate", domain, str(version), "--expected", "99")
+    ends(1, "unknown_map", "activate", domain, "999")
     client.admin.put_domain("fresh", ENCODINGS)
-    refused(1, "no_earlier_map", "rollback", "fresh")
+    ends(1, "no_earlier_map", "rollback", "fresh")
 
 
-def test_a_drive_is_appended(client, domain, out, refused):
+def test_a_drive_is_appended(client, domain, out, ends):
     old_domain = client.domain(domain)
     job = out("remap", "--domain", domain, "--training", "winter", "--append", "--no-activate", "--json")
     client.admin.activate(domain, job["result"]["map_version"], expected=old_domain.map_version)
@@ -100,10 +73,10 @@ def test_a_drive_is_appended(client, domain, out, refused):
     client.admin.activate(domain, old_domain.map_version)
     assert (old_domain.n_map_images, new_domain.n_map_images) == (120, 120), "the same places, seen in one more season"
     command = ["remap", "--domain", domain, "--training", "winter", "--append", "--landmarks", "landmarks"]
-    refused(2, "leave --landmarks out", *command)
+    ends(2, "leave --landmarks out", *command)
 
 
-def test_a_map_is_fetched_and_deleted(client, domain, tmp_path, out, refused):
+def test_a_map_is_fetched_and_deleted(client, domain, tmp_path, out, ends):
     file = tmp_path / "map.sqlite"
     fetched = out("download", domain, "1", str(file), "--json")
     (first,) = [version for version in client.admin.maps(domain) if version.version == 1]
@@ -111,17 +84,17 @@ def test_a_map_is_fetched_and_deleted(client, domain, tmp_path, out, refused):
     assert (fetched["sha256"], fetched["file_bytes"]) == (first.sha256, first.file_bytes)
     with closing(sqlite3.connect(file)) as db:
         assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    refused(2, "--force", "download", domain, "1", str(file))
+    ends(2, "--force", "download", domain, "1", str(file))
     assert first.sha256 in out("download", domain, "1", str(file), "--force")
     (tmp_path / f"again.{first.sha256}.part").write_bytes(file.read_bytes()[:50_000])
     out("download", domain, "1", str(tmp_path / "again"))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys(
         (file.name, "again"), file.read_bytes()
     )
-    refused(1, "map_in_use", "delete-map", domain, "1", "--yes")  # it serves
+    ends(1, "map_in_use", "delete-map", domain, "1", "--yes")  # it serves
     deleted = out("delete-map", domain, "2", "--yes", "--json")
     assert deleted == {"domain": domain, "version": 2, "deleted": True}
-    refused(1, "retired_map", "download", domain, "2", str(tmp_path / "gone"))
+    ends(1, "retired_map", "download", domain, "2", str(tmp_path / "gone"))
     assert "removed" in out("maps", domain)
 
 
@@ -154,9 +127,9 @@ def test_sessions_and_traverses_are_listed_and_ended(client, domain, out):
     assert out("jobs", "--domain", domain, "--last", "2", "--json") == jobs[:2]
 
 
-def test_nothing_is_deleted_where_nobody_can_be_asked(client, domain, out, refused):
+def test_nothing_is_deleted_where_nobody_can_be_asked(client, domain, out, ends):
     for command in (["delete-domain", domain], ["delete-traverse", domain, "winter"], ["delete-map", domain, "1"]):
-        refused(2, "--yes", *command)
+        ends(2, "--yes", *command)
     assert client.admin.traverse(domain, "winter").n_frames == 120
     for options, printed in ((["--json"], {"domain": "brief", "deleted": True}), ([], "")):
         client.admin.put_domain("brief", ENCODINGS)

@@ -4,19 +4,17 @@ import json
 import re
 import threading
 
-import cv2
 import numpy as np
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.commands import run
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import in_order, upload
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.passive import replay
 from deepsimbad_client.replay.report import summarise
 
-from ..conftest import ENCODINGS
+from ..conftest import ENCODINGS, draw
 
 
 def test_an_upload_goes_on_where_it_stopped(client, encodings, monkeypatch):
@@ -43,45 +41,34 @@ def test_an_upload_goes_on_where_it_stopped(client, encodings, monkeypatch):
     assert client.admin.traverse("again", "t") == stored
 
 
-def test_another_drive_or_corrected_positions_never_pass_for_what_is_there(client, tmp_path, capsys):
-    def drive(name, seed, n, metres, first_us=1_700_000_000_000_000):
-        folder = tmp_path / name
-        folder.mkdir(exist_ok=True)
-        rng = np.random.default_rng(seed)
-        for number in range(n):
-            cv2.imwrite(str(folder / f"{number}.png"), cv2.resize(rng.integers(0, 255, (4, 6, 3), np.uint8), (96, 64)))
+def test_another_drive_or_corrected_positions_never_pass_for_what_is_there(client, tmp_path, command, out):
+    def upload_of(seed, n, metres, first_us=1_700_000_000_000_000):
+        folder = draw(tmp_path / f"season {seed}", n, seed)
         lines = [f"{number}.png,{metres * number},{first_us + 200_000 * number}" for number in range(n)]
         (folder / "positions.csv").write_text("\n".join(["name,position_m,timestamp_us", *lines]))
-        return ["upload", str(folder), "--server", client.url, "--domain", "identity", "--traverse", "drive"]
-
-    def run_and_read(command):
-        code, (out, err) = run(command), capsys.readouterr()
-        return code, out, err
+        return ["upload", folder, "--domain", "identity", "--traverse", "drive"]
 
     client.admin.put_domain("identity", {"kind": "feature_l2", "extractor": "gradient_grid"})
-    summer = drive("summer", 1, 6, 1)
-    assert run_and_read(summer)[0] == 0
+    summer = upload_of(1, 6, 1)
+    out(*summer)
     first = client.admin.traverse("identity", "drive")
     assert (first.n_frames, first.length_m, first.span_us) == (6, 5.0, (1_700_000_000_000_000, 1_700_000_001_000_000))
-    code, out, _ = run_and_read(summer)
-    assert (code, "0 frames sent" in out, "6 were there already" in out) == (0, True, True)
+    assert re.search("0 frames sent.*6 were there already", out(*summer))
     for changed, differ in (
-        (("summer", 1, 6, 7), "5 of the 6 that both have differ in position (1.png, 2.png, 3.png, ...)"),
-        (("summer", 1, 6, 1, 1_600_000_000_000_000), "6 of the 6 that both have differ in time"),
-        (("winter", 2, 8, 1), "6 of the 6 that both have differ in content"),
+        ((1, 6, 7), "5 of the 6 that both have differ in position (1.png, 2.png, 3.png, ...)"),
+        ((1, 6, 1, 1_600_000_000_000_000), "6 of the 6 that both have differ in time"),
+        ((2, 8, 1), "6 of the 6 that both have differ in content"),
     ):
-        code, out, err = run_and_read(drive(*changed))
-        assert (code, out) == (1, "")
-        assert differ in err
-        assert "--replace" in err
+        result = command(*upload_of(*changed))
+        assert differ in result.line
+        assert "--replace" in result.line
         assert client.admin.traverse("identity", "drive") == first
-    code, out, _ = run_and_read([*drive("summer", 1, 6, 7), "--replace"])
-    assert (code, "5 frames sent" in out, "1 were there already" in out) == (0, True, True)
+    assert re.search("5 frames sent.*1 were there already", out(*upload_of(1, 6, 7), "--replace"))
     corrected = client.admin.traverse("identity", "drive")
     assert (corrected.n_frames, corrected.length_m) == (6, 35.0)
-    assert run_and_read([*drive("summer", 1, 6, 1), "--replace"])[0] == 0
+    out(*upload_of(1, 6, 1), "--replace")
     assert client.admin.traverse("identity", "drive").digest == first.digest != corrected.digest
-    assert run_and_read([*drive("winter", 2, 8, 1), "--replace"])[0] == 0
+    out(*upload_of(2, 8, 1), "--replace")
     assert client.admin.traverse("identity", "drive").n_frames == 8
 
 
@@ -116,13 +103,8 @@ def test_a_failure_comes_in_its_turn_and_stops_the_rest():
     assert len(items) < 20
 
 
-def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    rng = np.random.default_rng(3)
-    for number in range(8):
-        picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
-        cv2.imwrite(str(folder / f"{number}.jpg"), picture)
+def test_images_with_a_broken_one_among_them(client, tmp_path, command, ends):
+    folder = draw(tmp_path / "images", 8, form="{}.jpg", size=(320, 240))
     (folder / "3.jpg").write_bytes((folder / "3.jpg").read_bytes()[:-500])
     client.admin.put_domain("pictures", {"kind": "feature_l2"})
     report = upload(client, open_source(str(folder)), "pictures", "t", concurrency=3)
@@ -132,75 +114,53 @@ def test_images_with_a_broken_one_among_them(client, tmp_path, capsys):
     summary = summarise(result)
     assert (summary["n_queries"], summary["n_broken"], summary["left_out"]) == (7, *[dict(report.n_broken)] * 2)
     too_many = "frames_left_out: 12% of the frames of images are left out: 1 undecodable (3.jpg); more than 5% need"
-    commands = (["upload", "--traverse", "again"], ["replay", "--out", str(tmp_path / "again"), "--no-plots"])
-    for command in commands:
-        command += ["--server", client.url, "--domain", "pictures", str(folder)]
-        capsys.readouterr()
-        assert run(command) == 1
-        assert too_many in capsys.readouterr().err
-        assert run([*command, "--allow-missing", "--verbose"]) == 0
-        assert "images: left out: 1 undecodable (3.jpg)" in capsys.readouterr().err
+    for words in (("upload", "--traverse", "again"), ("replay", "--out", tmp_path / "again", "--no-plots")):
+        ends(1, too_many, *words, "--domain", "pictures", folder)
+        result = command(*words, "--domain", "pictures", folder, "--allow-missing", "--verbose")
+        assert (result.code, "images: left out: 1 undecodable (3.jpg)" in result.err) == (0, True), result
     answer = client.localize("pictures", folder / "5.jpg", shortlist=3)
     assert len(answer.retrieval) == 3
 
 
-def test_the_command_line_end_to_end(service, encodings, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("DEEPSIMBAD_URL", service)
-    for name in ("landmarks", "summer"):
-        assert run(["upload", str(encodings / f"{name}.npy"), "--domain", "cli", "--traverse", name, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out.partition("}\n{")[0] + "}")["n_sent"] == 60
-    command = ["remap", "--domain", "cli", "--training", "summer", "--landmarks", "landmarks", "--n-landmarks", "50"]
-    assert run([*command, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["result"]["map_version"] == 1
-    out = tmp_path / "out"
-    command = ["replay", f"{encodings / 'winter.npy'}#:40", "--domain", "cli", "--out", str(out)]
-    assert run([*command, "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == json.loads((out / "summary.json").read_text())
-    assert len((out / "steps.jsonl").read_text().splitlines()) == 40
+def test_the_command_line_end_to_end(command, out, ends, encodings, tmp_path):
+    for name, n_sent in (("landmarks", 60), ("summer", 120)):
+        sent = out("upload", encodings / f"{name}.npy", "--domain", "cli", "--traverse", name, "--json")
+        assert sent["n_sent"] == n_sent
+    remap_words = ("remap", "--domain", "cli", "--training")
+    job = out(*remap_words, "summer", "--landmarks", "landmarks", "--n-landmarks", "50", "--json")
+    assert job["result"]["map_version"] == 1
+    folder = tmp_path / "out"
+    replay_words = ("replay", f"{encodings / 'winter.npy'}#:40", "--domain", "cli", "--out", folder)
+    summary = out(*replay_words, "--json")
+    assert summary == json.loads((folder / "summary.json").read_text())
+    assert len((folder / "steps.jsonl").read_text().splitlines()) == 40
     for picture in ("rank_along_route", "belief_along_drive"):
-        assert (out / f"{picture}.png").read_bytes().startswith(b"\x89PNG")
-    assert run([*command, "--json"]) == 0  # a second run has nothing left to ask
-    assert json.loads(capsys.readouterr().out)["anr"] == printed["anr"]
-    assert run([*command, "--tolerance", "9"]) == 1
-    assert "tolerance_m" in capsys.readouterr().err
-    assert run([*command, "--restart", "--no-plots"]) == 0
-    assert "ANR" in capsys.readouterr().out
-    assert run(["domains"]) == 0
-    assert "cli" in capsys.readouterr().out
-    assert run(["jobs"]) == 0
-    assert "succeeded" in capsys.readouterr().out
-    assert run(["remap", "--domain", "cli", "--training", "landmarks", "--append", "--no-same-route"]) == 0
-    assert "the drive is not fused: the two drives are said not to share" in capsys.readouterr().err
-    assert run(["remap", "--domain", "cli", "--training", "summer", "--camera-of", "nowhere"]) == 1
-    assert "nowhere" in capsys.readouterr().err
-    assert run(["remap", "--domain", "cli", "--training", "nothing"]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
+        assert (folder / f"{picture}.png").read_bytes().startswith(b"\x89PNG")
+    assert out(*replay_words, "--json")["anr"] == summary["anr"]  # a second run has nothing left to ask
+    ends(1, "tolerance_m", *replay_words, "--tolerance", "9")
+    assert "ANR" in out(*replay_words, "--restart", "--no-plots")
+    assert "cli" in out("domains")
+    assert "succeeded" in out("jobs")
+    unfused = "the drive is not fused: the two drives are said not to share"
+    ends(0, unfused, *remap_words, "landmarks", "--append", "--no-same-route")
+    ends(1, "nowhere", *remap_words, "summer", "--camera-of", "nowhere")
+    assert "nothing" in command(*remap_words, "nothing").line
 
 
-def test_a_robot_that_may_go_backward_drives_a_map_of_its_own_landmarks(
-    service, encodings, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setenv("DEEPSIMBAD_URL", service)
-    upload_command = ["upload", str(encodings / "summer.npy"), "--domain", "own", "--traverse", "summer", "--actions-m"]
-    assert run([*upload_command, "1,x"]) == 2
-    assert run([*upload_command, "1,-5"]) == 1
-    assert "ascend" in capsys.readouterr().err
-    assert run([*upload_command, "-5,0,1,10"]) == 0
-    capsys.readouterr()
-    command = ["remap", "--domain", "own", "--training", "summer", "--n-landmarks", "40", "--json"]
-    assert run(command) == 0
-    job = json.loads(capsys.readouterr().out)
-    assert job["result"]["metrics"]["landmarks"] == "training_traverse"
-    assert run(["localize", "--json", "--domain", "own", f"{encodings / 'winter.npy'}#30:31"]) == 0
-    (answer,) = json.loads(capsys.readouterr().out)
+def test_a_robot_that_may_go_backward_drives_a_map_of_its_own_landmarks(encodings, tmp_path, out, ends):
+    upload_words = ("upload", encodings / "summer.npy", "--domain", "own", "--traverse", "summer", "--actions-m")
+    ends(2, "give metres as -5,0,1,10", *upload_words, "1,x")
+    ends(1, "ascend", *upload_words, "1,-5")
+    out(*upload_words, "-5,0,1,10")
+    remap_words = ("remap", "--domain", "own", "--training", "summer", "--n-landmarks", "40", "--json")
+    assert out(*remap_words)["result"]["metrics"]["landmarks"] == "training_traverse"
+    (answer,) = out("localize", "--json", "--domain", "own", f"{encodings / 'winter.npy'}#30:31")
     assert answer["belief"]["mode_m"] == 30
-    assert run(command) == 0
-    assert json.loads(capsys.readouterr().out)["result"]["metrics"]["landmarks"] == "active_map"
+    assert out(*remap_words)["result"]["metrics"]["landmarks"] == "active_map"
     planners = ("constant:-5", "constant:0")
-    replay_command = ["replay", str(encodings / "winter.npy"), "--domain", "own", "--out", str(tmp_path), "--no-plots"]
     planner_words = [word for planner in planners for word in ("--planner", planner)]
-    assert run([*replay_command, *planner_words, "--episodes", "2", "--steps", "2"]) == 0
+    drive_words = ("--domain", "own", "--out", tmp_path, "--no-plots", "--episodes", "2", "--steps", "2")
+    out("replay", encodings / "winter.npy", *drive_words, *planner_words)
     steps = [json.loads(line) for line in (tmp_path / "steps.jsonl").read_text().splitlines()]
     moves_m = {planner: [step["action_m"] for step in steps if step["planner"] == planner] for planner in planners}
     assert moves_m == {"constant:-5": 2 * [0, -5, -5], "constant:0": 6 * [0]}
@@ -208,42 +168,32 @@ def test_a_robot_that_may_go_backward_drives_a_map_of_its_own_landmarks(
     assert all(step["error_m"] < 1 for step in steps if step["step"] == 2)
 
 
-def test_places_on_the_command_line(client, encodings, tmp_path, capsys):
-    folder = tmp_path / "look [here]"
-    folder.mkdir()
-    rng = np.random.default_rng(5)
-    for number in range(6):
-        cv2.imwrite(str(folder / f"{number}.png"), cv2.resize(rng.integers(0, 255, (4, 6, 3), np.uint8), (96, 64)))
+def test_places_on_the_command_line(client, encodings, tmp_path, command, out, ends):
+    folder = draw(tmp_path / "look [here]", 6)
     client.admin.put_domain("places", {"kind": "feature_l2"})
     upload(client, open_source(str(folder)), "places", "t")
     remap(client, "places", "t", landmark_traverse="t", n_landmarks=6, list_length=2)
-    command = ["localize", "--server", client.url]
-    assert run([*command, "--json", "--domain", "places", str(folder / "4.png"), f"{folder}#1:3"]) == 0
-    answers = json.loads(capsys.readouterr().out)
+    localize = ("localize", "--domain", "places")
+    answers = out(*localize, "--json", folder / "4.png", f"{folder}#1:3")
     assert [answer["retrieval"][0]["map_image"] for answer in answers] == [4, 1, 2]
     assert [answer["belief"]["top"][0]["frame"] for answer in answers] == ["4.png", "1.png", "2.png"]
-    assert run([*command, "--json", "--domain", "route", f"{encodings / 'summer.npy'}#7:8"]) == 0
-    assert json.loads(capsys.readouterr().out)[0]["retrieval"][0]["map_image"] == 7
-    assert run([*command, "--domain", "places", str(folder / "4.png")]) == 0
-    printed = capsys.readouterr().out
+    (answer,) = out("localize", "--json", "--domain", "route", f"{encodings / 'summer.npy'}#7:8")
+    assert answer["retrieval"][0]["map_image"] == 7
+    printed = out(*localize, folder / "4.png")
     assert "likeliest [m]" in printed
     assert re.search(r"4\.png +│ 4\.png +│ +4\.0", printed), printed
     client.admin.warm("places")
     for domains in ("places,route", "*"):
-        assert run([*command, "--json", domains, str(folder / "4.png")]) == 0
-        (anywhere,) = json.loads(capsys.readouterr().out)
+        (anywhere,) = out("localize", "--json", domains, folder / "4.png")
         assert (anywhere["domains"][0]["domain"], anywhere["top"][0]["map_image"]) == ("places", 4)
         assert "route" in [out["domain"] for out in anywhere["left_out"]]
-    assert run([*command, "places,route", str(folder / "4.png")]) == 0
-    printed = capsys.readouterr()
-    assert re.search(r"4\.png +│ places +│ +\d+\.\d +│ 4\.png", printed.out), printed.out
-    assert "elsewhere" in printed.out
-    assert "route is left out" in printed.err
+    result = command("localize", "places,route", folder / "4.png")
+    assert re.search(r"4\.png +│ places +│ +\d+\.\d +│ 4\.png", result.out), result.out
+    assert (result.code, "elsewhere" in result.out, "route is left out" in result.err) == (0, True, True)
     answer = client.localize_anywhere(folder / "4.png", domains=["places", "route"], in_full=1)
     assert [out.code for out in answer.left_out] == ["unsupported_media_type"]
     assert answer.domains[0].probability + answer.others.probability + answer.elsewhere == pytest.approx(1)
-    assert run([*command, "--domain", "places", str(folder / "9.png")]) == 1
-    assert "no recording" in capsys.readouterr().err
+    ends(1, "no recording", *localize, folder / "9.png")
 
 
 def test_a_second_drive_that_shares_no_frame_with_the_first_is_refused_and_a_part_of_one_goes_on(client, encodings):
@@ -259,14 +209,11 @@ def test_a_second_drive_that_shares_no_frame_with_the_first_is_refused_and_a_par
     assert upload(client, open_source(f"{summer}#100:"), "parts", "t").n_skipped == 20
 
 
-def test_a_closed_domain_takes_one_turn_unasked(client, tmp_path, capsys):
-    lines = ["name,x_m,y_m"]
-    for number in range(60):
-        turn = 2 * np.pi * number / 40
-        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), np.full((48, 64, 3), number, np.uint8))
-        lines.append(f"{number:02d}.png,{20 * np.cos(turn):.3f},{20 * np.sin(turn):.3f}")
-    (tmp_path / "positions.csv").write_text("\n".join(lines))
+def test_a_closed_domain_takes_one_turn_unasked(client, tmp_path, ends):
+    turns = (2 * np.pi * number / 40 for number in range(60))
+    lines = (f"{number}.png,{20 * np.cos(turn):.3f},{20 * np.sin(turn):.3f}" for number, turn in enumerate(turns))
+    (draw(tmp_path, 60) / "positions.csv").write_text("\n".join(["name,x_m,y_m", *lines]))
     client.admin.put_domain("ring", {"kind": "feature_l2", "extractor": "gradient_grid"}, closed=True)
-    assert run(["upload", str(tmp_path), "--server", client.url, "--domain", "ring", "--traverse", "t"]) == 0
-    assert "19 frames of a second turn are not used" in capsys.readouterr().err
+    second_turn = "19 frames of a second turn are not used"
+    ends(0, second_turn, "upload", tmp_path, "--domain", "ring", "--traverse", "t")
     assert client.admin.traverse("ring", "t").n_frames == 41

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -11,17 +12,16 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from deepsimbad.cli import run as run_service
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.grey_levels import measured_levels
 from deepsimbad.evaluators.image import decode_image, is_blank, resized
 from deepsimbad_client import Client
-from deepsimbad_client.commands import run
 from deepsimbad_client.errors import InvalidInputError
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 
+from ...commands import run_command
 from ..conftest import serving
 
 NCLT_US = 1_326_030_975_000_000
@@ -78,47 +78,58 @@ def test_whether_a_view_shows_nothing_does_not_hang_on_who_made_it_small():
     assert is_blank(evaluator.prepare(night)) == is_blank(evaluator.prepare(resized(night, (128, 128)))) is True
 
 
-def test_a_view_has_one_answer_by_every_route(tmp_path, capsys):
-    drive, looks = tmp_path / "drive", tmp_path / "looks"
-    for folder in (drive, looks):
-        folder.mkdir()
+@contextmanager
+def mapped(data_dir, source):
+    """A client of a service whose domain `yard` is mapped from a recording."""
+    with serving(data_dir) as url, Client(url) as client:
+        client.admin.put_domain("yard", EVALUATOR)
+        upload(client, open_source(str(source)), "yard", "t")
+        remap(client, "yard", "t", n_landmarks=8, list_length=4)
+        yield client
+
+
+def posted(client, media_type, *bodies):
+    """The answers to images that are sent without the client."""
+    address, header = f"{client.url}/v1/domains/yard/localizations", {"Content-Type": media_type}
+    return [httpx2.post(address, content=body, headers=header).json() for body in bodies]
+
+
+def printed(program, *words, **environment):
+    """The answers that `localize` prints, and what it says beside them."""
+    result = run_command([program, "localize", *words, "--json"], **environment)
+    assert result.code == 0, result.err
+    return json.loads(result.out), result.err
+
+
+def test_a_view_has_one_answer_by_every_route(tmp_path):
+    drive, looks, data_dir = (tmp_path / name for name in ("drive", "looks", "data"))
+    drive.mkdir()
+    looks.mkdir()
     for place in range(12):
         cv2.imwrite(str(drive / f"{place:02}.png"), scene(100 + place))
     for number, form in enumerate(("jpg", "png", "tiff")):
         cv2.imwrite(str(looks / f"{number}.{form}"), cv2.convertScaleAbs(scene(103 + 3 * number), alpha=0.8, beta=15))
-    paths, data_dir = sorted(map(str, looks.iterdir())), str(tmp_path / "data")
-    with serving(tmp_path / "data") as url, Client(url) as client:
-        client.admin.put_domain("yard", EVALUATOR)
-        upload(client, open_source(str(drive)), "yard", "t")
-        remap(client, "yard", "t", n_landmarks=8, list_length=4)
-        by_python = [client.localize("yard", path) for path in paths]
-        bodies = [(looks / path).read_bytes() for path in paths]
-        address, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/jpeg"}
-        by_curl = [httpx2.post(address, content=body, headers=header).json() for body in bodies]
+    paths, here = sorted(looks.iterdir()), {"DEEPSIMBAD_DATA_DIR": str(data_dir)}
+    with mapped(data_dir, drive) as client:
+        by_python = [client.localize("yard", path).model_dump(mode="json") for path in paths]
         eyes = client.on_board("yard")
         by_ranks = [client.localize("yard", on_board=eyes.ranks(path, m=8)) for path in paths]
-        capsys.readouterr()
-        assert run(["localize", "yard", *paths, "--server", url, "--json"]) == 0
-        assert run(["localize", "yard", "--server", url]) == 2
-        by_command = json.loads(capsys.readouterr().out)
-        assert run(["localize", str(looks), "--domain", "yard", "--server", url, "--json"]) == 0
-        by_folder = json.loads(capsys.readouterr().out)
-    assert run_service(["localize", "yard", *paths, "--data-dir", data_dir, "--json"]) == 0
-    by_service_command = json.loads(capsys.readouterr().out)
-    made_here = ["map", "own", "--training", str(drive), "--evaluator", "feature_l2:gradient_grid"]
-    assert run_service([*made_here, "--n-landmarks", "8", "--data-dir", data_dir]) == 0
-    capsys.readouterr()
-    assert run_service(["localize", "own", *paths, "--data-dir", data_dir, "--json"]) == 0
-    by_own_map = json.loads(capsys.readouterr().out)
-    for number, answer in enumerate(by_python):
-        expected = answer.model_dump(mode="json")
-        assert expected["belief"]["mode_m"] == 3 * (number + 1), "else nothing is shown"
-        for other in (by_curl, by_command, by_folder, by_service_command, by_own_map):
-            for part in ("belief", "retrieval", "informative"):
-                assert other[number][part] == expected[part]
+        answers = [
+            posted(client, "image/jpeg", *(path.read_bytes() for path in paths)),
+            printed("deepsimbad-client", "yard", *paths, "--server", client.url)[0],
+            printed("deepsimbad-client", looks, "--domain", "yard", "--server", client.url)[0],
+        ]
+        assert run_command(["deepsimbad-client", "localize", "yard", "--server", client.url]).code == 2
+    make = ["deepsimbad", "map", "own", "--training", drive, "--evaluator", "feature_l2:gradient_grid"]
+    assert run_command([*make, "--n-landmarks", "8"], **here).code == 0
+    answers += [printed("deepsimbad", domain, *paths, **here)[0] for domain in ("yard", "own")]
+    assert [expected["belief"]["mode_m"] for expected in by_python] == [3, 6, 9], "else nothing is shown"
+    for other in answers:
+        for part in ("belief", "retrieval", "informative"):
+            assert [answer[part] for answer in other] == [expected[part] for expected in by_python]
+    for expected, answer in zip(by_python, by_ranks, strict=True):
         # Eight ranks are less than an encoding: they need not agree on the very best.
-        best = [image.map_image for image in by_ranks[number].retrieval[:3]]
-        assert expected["retrieval"][0]["map_image"] in best
+        assert expected["retrieval"][0]["map_image"] in [image.map_image for image in answer.retrieval[:3]]
 
 
 def write_nclt(root, date, n, alpha=1.0):
@@ -135,42 +146,34 @@ def write_nclt(root, date, n, alpha=1.0):
     return camera
 
 
-def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path, capsys):
+def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path):
     """A raw image, whoever sends it, is turned as the map's images were, and the answer says so."""
     write_nclt(tmp_path / "nclt", "2012-01-08", 12)
     looks = write_nclt(tmp_path / "nclt", "2012-02-05", 12, alpha=0.8)
-    loose = tmp_path / "loose"
+    loose, data_dir = tmp_path / "loose", tmp_path / "data"
     shutil.copytree(looks, loose)
-    paths, data_dir = sorted(map(str, loose.iterdir()))[2:5], str(tmp_path / "data")
-    with serving(tmp_path / "data") as url, Client(url) as client:
-        client.admin.put_domain("yard", EVALUATOR)
-        upload(client, open_source(f"nclt:{tmp_path}/nclt/2012-01-08"), "yard", "t")
-        remap(client, "yard", "t", n_landmarks=8, list_length=4)
+    paths = sorted(loose.iterdir())[2:5]
+    commands = {
+        "files": paths,
+        "drive": [f"nclt:{tmp_path}/nclt/2012-02-05#2:5"],
+        "camera's folder": [f"{looks}#2:5"],
+        "folder": [f"{loose}#2:5"],
+    }
+    with mapped(data_dir, f"nclt:{tmp_path}/nclt/2012-01-08") as client:
         answers = {"Python": [client.localize("yard", path).model_dump(mode="json") for path in paths]}
         with client.session("yard") as session:
             in_session = session.observe(paths[0])
-        address, header = f"{url}/v1/domains/yard/localizations", {"Content-Type": "image/tiff"}
-        posted = [httpx2.post(address, content=Path(path).read_bytes(), headers=header).json() for path in paths]
-        commands = {
-            "files": ["yard", *paths],
-            "drive": ["yard", f"nclt:{tmp_path}/nclt/2012-02-05#2:5"],
-            "camera's folder": ["yard", f"{looks}#2:5"],
-            "folder": ["yard", f"{loose}#2:5"],
-        }
-        capsys.readouterr()
+        by_curl = posted(client, "image/tiff", *(path.read_bytes() for path in paths))
         for route, words in commands.items():
-            assert run(["localize", *words, "--server", url, "--json"]) == 0
-            answers[f"client, {route}"] = json.loads(capsys.readouterr().out)
+            answers[f"client, {route}"], _ = printed("deepsimbad-client", "yard", *words, "--server", client.url)
     for route, words in commands.items():
-        assert run_service(["localize", *words, "--data-dir", data_dir, "--json"]) == 0
-        out, err = capsys.readouterr()
-        answers[f"here, {route}"] = json.loads(out)
-        assert err.count("upright") == (route != "drive")
-    assert [answer["belief"]["mode_m"] for answer in posted] == pytest.approx([2.2, 3.2, 4.2]), "else nothing is shown"
-    for answer in (posted[0], in_session.model_dump()):
+        answers[f"here, {route}"], remarks = printed("deepsimbad", "yard", *words, "--data-dir", data_dir)
+        assert remarks.count("upright") == (route != "drive")
+    assert [answer["belief"]["mode_m"] for answer in by_curl] == pytest.approx([2.2, 3.2, 4.2]), "else nothing is shown"
+    for answer in (by_curl[0], in_session.model_dump()):
         assert any("as NCLT's files do: it was turned by 90 degrees" in warning for warning in answer["warnings"])
     for route, route_answers in answers.items():
-        for answer, expected in zip(route_answers, posted, strict=True):
+        for answer, expected in zip(route_answers, by_curl, strict=True):
             assert (answer["belief"], answer["retrieval"]) == (expected["belief"], expected["retrieval"]), route
 
 
@@ -179,8 +182,8 @@ def deep(seed):
     return (2000 + 2 * scene(seed)[..., 1].astype(np.uint16)).astype(np.uint16)
 
 
-def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, capsys):
-    drive, look, data_dir = tmp_path / "drive", tmp_path / "look.png", str(tmp_path / "data")
+def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path):
+    drive, look, data_dir = (tmp_path / name for name in ("drive", "look.png", "data"))
     drive.mkdir()
     for place in range(12):
         cv2.imwrite(str(drive / f"{place:02}.png"), deep(100 + place))
@@ -188,42 +191,34 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path, caps
     sunny = deep(105)
     sunny[:12, :60] = 4000  # which would change the levels of the picture alone
     cv2.imwrite(str(look), sunny)
-    levels = open_source(str(drive)).grey_levels
-    image, header = look.read_bytes(), {"Content-Type": "image/png"}
-    with serving(tmp_path / "data") as url, Client(url) as client:
-        client.admin.put_domain("yard", EVALUATOR)
-        upload(client, open_source(str(drive)), "yard", "t")
+    image, levels = look.read_bytes(), open_source(str(drive)).grey_levels
+    with mapped(data_dir, drive) as client:
         stored = client.admin.traverse("yard", "t")
         assert (stored.grey_levels, stored.n_uninformative) == (levels, 1)
         assert upload(client, open_source(f"{drive}#3:6"), "yard", "t").n_skipped == 3
-        job = remap(client, "yard", "t", n_landmarks=8, list_length=4)
-        assert job.result["metrics"]["n_uninformative"] == 1
+        assert client.admin.maps("yard")[0].metrics["n_uninformative"] == 1
         assert client.domain("yard").grey_levels == levels
-        by_curl = httpx2.post(f"{url}/v1/domains/yard/localizations", content=image, headers=header).json()
+        (by_curl,) = posted(client, "image/png", image)
         eyes = client.on_board("yard")
         assert eyes.ranks(look, m=8) == eyes.ranks(decode_image(image, LIMIT, levels=levels), m=8)
         with client.session("yard") as session:
             in_session = session.observe(image=image)
             bright = session.observe(image=cv2.imencode(".png", deep(105) + np.uint16(200))[1].tobytes())
             flat = session.observe(image=cv2.imencode(".png", scene(105) >> 5)[1].tobytes())
-        capsys.readouterr()
-        assert run(["localize", str(look), "--domain", "yard", "--server", url, "--json"]) == 0
-        (by_command,) = json.loads(capsys.readouterr().out)
-        frame = f"{url}/v1/admin/domains/yard/traverses/raw/frames"
+        answers = printed("deepsimbad-client", "yard", look, "--server", client.url)[0]
         client.admin.create_traverse("yard", "raw")
         for place, name in enumerate(("12.png", "00.png", "01.png")):
-            body = (drive / name).read_bytes()
-            httpx2.put(f"{frame}/{place}?position_m={place}", content=body, headers=header).raise_for_status()
+            client.admin.put_frame("yard", "raw", place, (drive / name).read_bytes(), position_m=place)
         raw = client.admin.traverse("yard", "raw")
         assert raw.n_uninformative == 1
         assert raw.grey_levels == measured_levels([cv2.imread(str(drive / "00.png"), cv2.IMREAD_UNCHANGED)])
         with pytest.raises(InvalidInputError, match="black and white"):
             client.admin.create_traverse("yard", "odd", grey_levels=(9, 9))
-    assert run_service(["localize", "yard", str(look), "--data-dir", data_dir, "--json"]) == 0
-    (by_service_command,) = json.loads(capsys.readouterr().out)
+    answers += printed("deepsimbad", "yard", look, "--data-dir", data_dir)[0]
     assert by_curl["belief"]["mode_m"] == 5
-    for other in (by_command, by_service_command):
-        assert (other["belief"], other["retrieval"]) == (by_curl["belief"], by_curl["retrieval"])
+    assert [(answer["belief"], answer["retrieval"]) for answer in answers] == 2 * [
+        (by_curl["belief"], by_curl["retrieval"])
+    ]
     assert any("another bit depth" in warning for warning in bright.warnings)
     assert not any("bit depth" in warning for warning in [*in_session.warnings, *flat.warnings])
     assert any("8 grey levels of 256" in warning for warning in flat.warnings)

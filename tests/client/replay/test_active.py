@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from deepsimbad_client import errors
-from deepsimbad_client.commands import run
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import Stage, active_replay
 
@@ -198,23 +197,19 @@ def test_of_many_episodes_few_keep_their_whole_belief(drive_actively):
     assert [bool(episode.steps[0].mass) for episode in episodes] == [True] * 10 + [False] * 2
 
 
-def test_the_commands_end_to_end(route, encodings, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("DEEPSIMBAD_URL", route)
-    out = tmp_path / "out"
-    plain = ["replay", str(encodings / "winter.npy"), "--domain", "route"]
-    command = [*plain, "--out", str(out), "--planner", "default", "--planner", "random", "--steps", "5", "--seed", "1"]
-    assert run([*command, "--episodes", "3", "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == json.loads((out / "summary.json").read_text())
-    assert set(printed["anr"]) == {"default", "random"}
-    assert len((out / "episodes.jsonl").read_text().splitlines()) == 6
-    assert len((out / "steps.jsonl").read_text().splitlines()) == 6 * 6
-    assert (out / "belief_by_step.png").read_bytes().startswith(b"\x89PNG")
-    assert run([*command, "--episodes", "4", "--no-plots"]) == 0  # two more episodes
-    assert "informed (default)" in capsys.readouterr().out
-    assert len((out / "episodes.jsonl").read_text().splitlines()) == 8
-    assert run([*command[:-1], "2"]) == 1
-    assert "seed 1, now 2" in capsys.readouterr().err
-    assert run([*plain, "--episodes", "3"]) == 2
-    assert run([*plain, "--planner", "random", "--tolerance", "3"]) == 2
-    assert run([*plain, "--planner", "nonsense", "--out", str(tmp_path / "no")]) == 1
+def test_the_commands_end_to_end(encodings, tmp_path, command, out, ends):
+    folder = tmp_path / "out"
+    plain = ("replay", encodings / "winter.npy", "--domain", "route")
+    words = (*plain, "--out", folder, "--planner", "default", "--planner", "random", "--steps", "5", "--seed")
+    summary = out(*words, "1", "--episodes", "3", "--json")
+    assert summary == json.loads((folder / "summary.json").read_text())
+    assert set(summary["anr"]) == {"default", "random"}
+    assert len((folder / "episodes.jsonl").read_text().splitlines()) == 6
+    assert len((folder / "steps.jsonl").read_text().splitlines()) == 6 * 6
+    assert (folder / "belief_by_step.png").read_bytes().startswith(b"\x89PNG")
+    assert "informed (default)" in out(*words, "1", "--episodes", "4", "--no-plots")
+    assert len((folder / "episodes.jsonl").read_text().splitlines()) == 8, "two more"
+    ends(1, "seed 1, now 2", *words, "2")
+    assert command(*plain, "--episodes", "3").code == 2
+    assert command(*plain, "--planner", "random", "--tolerance", "3").code == 2
+    assert command(*plain, "--planner", "nonsense", "--out", tmp_path / "no").code == 1

@@ -4,15 +4,15 @@ import base64
 import json
 import sys
 
-import cv2
 import numpy as np
 import pytest
 
-from deepsimbad_client.commands import run
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.upload import upload
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay import viewers
+
+from ..conftest import draw
 
 ANCHOR = {"lat_deg": 42.29, "lon_deg": -83.71, "bearing_deg": 0.0, "height_m": 270.0}
 N_FRAMES = 12
@@ -21,16 +21,9 @@ N_FRAMES = 12
 @pytest.fixture
 def seen_route(client, tmp_path):
     """A folder of images on a quarter of a circle, mapped as a domain with an anchor."""
-    folder = tmp_path / "drive"
-    folder.mkdir()
-    rng = np.random.default_rng(3)
-    lines = ["name,position_m,x_m,y_m"]
-    for number in range(N_FRAMES):
-        picture = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (160, 120), interpolation=cv2.INTER_CUBIC)
-        cv2.imwrite(str(folder / f"{number:02d}.jpg"), picture)
-        x_m, y_m = 40 * np.cos(number / 8), 40 * np.sin(number / 8)
-        lines.append(f"{number:02d}.jpg,{5 * number},{x_m},{y_m}")
-    (folder / "positions.csv").write_text("\n".join(lines))
+    folder = draw(tmp_path / "drive", N_FRAMES, form="{:02d}.jpg", size=(160, 120))
+    lines = (f"{n:02d}.jpg,{5 * n},{40 * np.cos(n / 8)},{40 * np.sin(n / 8)}" for n in range(N_FRAMES))
+    (folder / "positions.csv").write_text("\n".join(["name,position_m,x_m,y_m", *lines]))
     client.admin.put_domain("shown", {"kind": "feature_l2", "extractor": "gradient_grid"}, anchor=ANCHOR)
     upload(client, open_source(str(folder)), "shown", "t")
     remap(client, "shown", "t", list_length=2, training_episodes=10)
@@ -38,9 +31,14 @@ def seen_route(client, tmp_path):
     client.admin.delete_domain("shown")
 
 
-def replayed(client, folder, out, *options):
-    command = ["replay", str(folder), "--domain", "shown", "--server", client.url, "--out", str(out), "--no-plots"]
-    return run([*command, *map(str, options)])
+@pytest.fixture
+def replayed(command, seen_route, tmp_path):
+    """Replays the drive into a folder of this name."""
+
+    def replayed(name, *options):
+        return command("replay", seen_route, "--domain", "shown", "--out", tmp_path / name, "--no-plots", *options)
+
+    return replayed
 
 
 def messages(path):
@@ -55,10 +53,10 @@ def messages(path):
     return by_topic
 
 
-def test_an_mcap_file_holds_what_foxglove_shows(client, seen_route, tmp_path, capsys):
+def test_an_mcap_file_holds_what_foxglove_shows(replayed, seen_route, tmp_path):
     pytest.importorskip("mcap")
     path = tmp_path / "new" / "drive.mcap"
-    assert replayed(client, seen_route, tmp_path / "out", "--mcap", path) == 0
+    assert replayed("out", "--mcap", path).code == 0
     by_topic = messages(path)
     poses = by_topic["/pose", "foxglove.PoseInFrame"]
     assert len(poses) == N_FRAMES
@@ -79,23 +77,21 @@ def test_an_mcap_file_holds_what_foxglove_shows(client, seen_route, tmp_path, ca
     assert (images[4]["format"], body) == ("jpeg", (seen_route / "04.jpg").read_bytes())
     figures = [document for _, document in by_topic["/figures", "deepsimbad.Figures"]]
     assert figures[-1]["entropy_bits"] < figures[0]["entropy_bits"]
-    capsys.readouterr()
-    assert replayed(client, seen_route, tmp_path / "again", "--mcap", path) == 1
-    assert "is there already: name another file" in capsys.readouterr().err
+    assert "is there already: name another file" in replayed("again", "--mcap", path).line
 
 
-def test_episodes_of_an_active_replay_follow_each_other(client, seen_route, tmp_path):
+def test_episodes_of_an_active_replay_follow_each_other(replayed, tmp_path):
     pytest.importorskip("mcap")
     moves = ("--planner", "constant:5", "--episodes", 3, "--steps", 2)
-    assert replayed(client, seen_route, tmp_path / "out", *moves, "--mcap", tmp_path / "a.mcap") == 0
+    assert replayed("out", *moves, "--mcap", tmp_path / "a.mcap").code == 0
     assert len(messages(tmp_path / "a.mcap")["/figures", "deepsimbad.Figures"]) == 3 * 3
 
 
-def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client, seen_route, tmp_path, monkeypatch):
+def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(replayed, tmp_path, monkeypatch):
     chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
     path = tmp_path / "drive.rrd"
     monkeypatch.setattr(viewers, "show_window", lambda stream, layout: stream.save(path, layout))
-    assert replayed(client, seen_route, tmp_path / "out", "--rerun") == 0
+    assert replayed("out", "--rerun").code == 0
     store = chunk.RrdReader(str(path)).store()
     paths = {str(entity) for entity in store.schema().entity_paths()}
     world = {f"/world/{part}" for part in ("route", "belief", "likeliest", "truth", "next_move")}
@@ -107,13 +103,13 @@ def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(client,
     assert {rows[f"/{path}"] for path in ("view", "moves", "world/belief", "world/next_move")} == {N_FRAMES}
 
 
-@pytest.mark.parametrize("option", ["rerun", "mcap"])
-def test_without_the_library_one_line_says_what_to_install(client, seen_route, tmp_path, monkeypatch, capsys, option):
-    monkeypatch.setitem(sys.modules, {"rerun": "rerun", "mcap": "mcap.writer"}[option], None)
-    options = ["--rerun"] if option == "rerun" else ["--mcap", tmp_path / "x.mcap"]
-    assert replayed(client, seen_route, tmp_path / "out", *options) == 1
-    assert capsys.readouterr().err == (
-        f"deepsimbad-client: missing_extra: --{option} needs "
-        + {"rerun": "Rerun's viewer", "mcap": "the library mcap"}[option]
-        + f": pip install 'deep-simbad[{option}]'\n"
-    )
+@pytest.mark.parametrize(
+    ("words", "module", "needed"),
+    [(["--rerun"], "rerun", "Rerun's viewer"), (["--mcap", "x.mcap"], "mcap.writer", "the library mcap")],
+    ids=["rerun", "mcap"],
+)
+def test_without_the_library_one_line_says_what_to_install(replayed, monkeypatch, words, module, needed):
+    monkeypatch.setitem(sys.modules, module, None)
+    option = words[0]
+    install = f"pip install 'deep-simbad[{option.strip('-')}]'"
+    assert replayed("out", *words).line == f"deepsimbad-client: missing_extra: {option} needs {needed}: {install}"

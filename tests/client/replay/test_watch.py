@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from deepsimbad_client import errors
-from deepsimbad_client.commands import run
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.replay.active import Stage
 from deepsimbad_client.replay.watch import BLOCKS, belief_blocks, resampled, watch_episode, watch_session
@@ -79,13 +78,11 @@ def test_another_robots_session_is_watched_until_it_ends_and_left_alone(client, 
     assert f"route, map 1: session {watched.session_id[:8]}" in stream.getvalue()
 
 
-def test_the_command(route, encodings, capsys, monkeypatch):
-    monkeypatch.setenv("DEEPSIMBAD_URL", route)
-    assert run(["watch", str(encodings / "winter.npy"), "--domain", "route", "--steps", "3", "--pause", "0"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 4
-    assert run(["watch"]) == 2
-    assert run(["watch", "--session", "s", "--domain", "route"]) == 2
-    assert run(["watch", "--session", "nowhere"]) == 1
+def test_the_command(encodings, command, out):
+    lines = out("watch", encodings / "winter.npy", "--domain", "route", "--steps", "3", "--pause", "0").splitlines()
+    assert len(lines) == 4
+    refused = ([], ["--session", "s", "--domain", "route"], ["--session", "nowhere"])
+    assert [command("watch", *words).code for words in refused] == [2, 2, 1]
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=200), st.integers(1, 300))
