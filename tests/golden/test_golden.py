@@ -25,22 +25,9 @@ from deepsimbad_client.commands import cli
 from deepsimbad_client.http.local_server import LocalServer
 
 GOLDEN = Path(__file__).parent
-COMMANDS = [
-    *([], ["init"], ["serve"], ["keys"], ["keys", "create"], ["keys", "list"], ["keys", "revoke"], ["map"]),
-    *(
-        ["localize"],
-        ["try"],
-        ["info"],
-        ["delete-domain"],
-        ["experiment"],
-        ["experiment", "vpr"],
-        ["experiment", "nbv"],
-        ["settings"],
-    ),
-    *(["experiment", "calibration"], ["experiment", "paper"]),
-    *(["backup"], ["restore"], ["export"], ["import"], ["check"], ["weights"], ["weights", "list"]),
-    *(["weights", "pull"], ["weights", "verify"], ["ray"], ["ray", "map"]),
-]
+COMMANDS = """init, serve, keys, keys create, keys list, keys revoke, map, localize, try, info, delete-domain, settings,
+experiment, experiment vpr, experiment nbv, experiment calibration, experiment paper, backup, restore, export, import,
+check, weights, weights list, weights pull, weights verify, ray, ray map""".replace("\n", " ").split(", ")
 CLIENT_COMMANDS = """activate campus delete-domain delete-map delete-session delete-traverse domains download jobs
 localize maps remap replay rollback sessions traverses upload watch""".split()  # noqa: SIM905 - as one writes it
 
@@ -229,13 +216,13 @@ def test_help():
     texts = {}
     programs = (
         ("python -m deepsimbad", commands, 78, COMMANDS),
-        ("deepsimbad-client", cli, 98, [[], *([name] for name in CLIENT_COMMANDS)]),
+        ("deepsimbad-client", cli, 98, CLIENT_COMMANDS),
     )
-    for program, group, width, command_words in programs:
-        for words in command_words:
-            result = CliRunner().invoke(group, [*words, "--help"], prog_name=program, terminal_width=width)
+    for program, group, width, names in programs:
+        for name in ("", *names):
+            result = CliRunner().invoke(group, [*name.split(), "--help"], prog_name=program, terminal_width=width)
             assert result.exit_code == 0, result.output
-            texts[" ".join([program.removeprefix("python -m "), *words])] = result.output
+            texts[f"{program.removeprefix('python -m ')} {name}".strip()] = result.output
     check("help", texts)
 
 

@@ -13,6 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 from deepsimbad_client.errors import BrokenFrameError, MissingExtraError, SourceError
 from deepsimbad_client.recordings.sources import open_source
 
+from .conftest import pixels_of
+
 START_NS = 1_400_000_000_000_000_000
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 IMAGE = "sensor_msgs/msg/Image"
@@ -116,8 +118,7 @@ def odometry(drive):
 
 
 def sent_pixels(recording, row=0):
-    encoded = recording.image(recording.frames[row], None)
-    return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
+    return pixels_of(recording.image(recording.frames[row], None))
 
 
 @pytest.mark.parametrize("kind", ["bag", "folder", "mcap"])

@@ -7,6 +7,8 @@ import pytest
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings.sources import open_source
 
+from .conftest import pixels_of
+
 TIME_US = 1_418_132_000_000_000
 
 
@@ -98,8 +100,7 @@ def test_robotcar_is_placed_by_its_ins_and_its_mosaics_become_colours(tmp_path):
         recording = open_source(str(source))
         assert [frame.x_m for frame in recording.frames] == pytest.approx([100, 102.5, 105])
         assert recording.left_out == {"before or after the positions": 1}
-    body = np.frombuffer(recording.image(recording.frames[0], None).body, np.uint8)
-    blue, green, red = cv2.imdecode(body, cv2.IMREAD_COLOR)[2:-2, 2:-2].reshape(-1, 3).T
+    blue, green, red = pixels_of(recording.image(recording.frames[0], None))[2:-2, 2:-2].reshape(-1, 3).T
     assert red.min() > 200, "every pixel, by those beside it"
     assert max(blue.max(), green.max()) == 0
 

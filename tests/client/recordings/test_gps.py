@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ from deepsimbad_client.errors import MissingExtraError, SourceError
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.sources import open_source
 from deepsimbad_client.recordings.track import arc_length_m
+
+from .conftest import pixels_of
 
 START = 1_305_031_103  # 2011-05-10T12:38:23Z
 
@@ -29,6 +33,10 @@ def pictures(folder, names, **exif_of):
             exif.get_ifd(0x8825)[tag] = value
         Image.fromarray(np.full((12, 16, 3), 10 * place % 250, np.uint8)).save(folder / name, exif=exif)
     return str(folder)
+
+
+def table(source, header, rows):
+    (Path(source) / "positions.csv").write_text("\n".join([header, *rows]))
 
 
 def gpx(path, n=60):
@@ -128,15 +136,14 @@ def test_exif_places_the_images_that_have_it(tmp_path):
 
 def test_a_fix_of_nothing_is_of_no_zone(tmp_path):
     source = pictures(tmp_path / "drive", [f"{k}.png" for k in range(30)])
-    rows = "".join(f"{0 if k == 9 else 51 + k / 111_270},{0 if k == 9 else 9}\n" for k in range(30))
-    (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon\n{rows}")
+    table(source, "lat,lon", ("0,0" if k == 9 else f"{51 + k / 111_270},9" for k in range(30)))
     recording = open_source(source)
     assert (recording.left_out, list(recording.remarks)) == ({"without a position": 1}, [])
 
 
 def test_latitude_and_longitude_stand_in_a_table_too(tmp_path):
     source = pictures(tmp_path / "drive", ["0.png", "1.png", "2.png"])
-    (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon\n51,9\n,\n{51 + 50 / 111_270},9\n")
+    table(source, "lat,lon", ["51,9", ",", f"{51 + 50 / 111_270},9"])
     recording = open_source(source)
     assert recording.left_out == {"without a position": 1}
     assert recording.frames[1].position_m == pytest.approx(50, abs=0.1)
@@ -147,9 +154,8 @@ def test_a_receiver_that_wanders_while_it_stands_goes_nowhere(tmp_path):
     wander = np.cumsum(rng.normal(0, 0.05, 600))  # correlated, as a receiver's is: no white noise to tell it by
     wander -= np.linspace(wander[0], wander[-1], 600)
     along_m = np.concatenate((np.arange(100.0), 100 + wander, np.arange(100.0, 200)))
-    lines = "".join(f"{51 + metres / 111_270},9,{START + k}\n" for k, metres in enumerate(along_m))
     source = pictures(tmp_path / "drive", [f"{START + k}.png" for k in range(0, 800, 20)])
-    (tmp_path / "drive" / "positions.csv").write_text(f"lat,lon,time\n{lines}")
+    table(source, "lat,lon,time", (f"{51 + metres / 111_270},9,{START + k}" for k, metres in enumerate(along_m)))
     assert open_source(source).frames[-1].position_m == pytest.approx(180, abs=8)
 
 
@@ -170,8 +176,7 @@ def test_heic_is_read_or_its_library_is_named(tmp_path, monkeypatch):
     recording = open_source(str(tmp_path))
     encoded = recording.image(recording.frames[0], None)
     assert encoded.content_type == "image/png"
-    pixels = cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR_RGB)
-    assert np.abs(pixels.astype(int) - picture).mean() < 8
+    assert np.abs(pixels_of(encoded)[..., ::-1].astype(int) - picture).mean() < 8
     monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
     with pytest.raises(MissingExtraError, match=r"deep-simbad\[heic\]"):
         open_source(str(tmp_path))
@@ -198,6 +203,6 @@ def test_the_zone_is_that_of_most_places():
 
 def test_a_drive_across_a_zone_is_told(tmp_path):
     source = pictures(tmp_path / "drive", ["0.png", "1.png", "2.png"])
-    (tmp_path / "drive" / "positions.csv").write_text("lat,lon\n51,11.9999\n51,12.0001\n51,12.0002\n")
+    table(source, "lat,lon", ["51,11.9999", "51,12.0001", "51,12.0002"])
     (remark,) = open_source(source).remarks
     assert "crosses UTM zones (32, 33): x, y are metres of zone 33" in remark

@@ -9,10 +9,7 @@ from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.recordings.nclt import read_nclt
 from deepsimbad_client.recordings.sources import open_source
 
-
-def decoded(encoded):
-    assert encoded.content_type == "image/png"
-    return cv2.imdecode(np.frombuffer(encoded.body, np.uint8), cv2.IMREAD_COLOR)
+from .conftest import pixels_of
 
 
 def fill(tree, seconds=4, rate_hz=5, **kwargs):
@@ -57,9 +54,9 @@ def test_frames_are_upright_and_resized_without_loss(nclt_tree):
     fill(nclt_tree, seconds=1)
     recording = open_source(nclt_tree.source)
     for input_size, shape in ((None, (64, 48)), ((48, 64), (64, 48)), ((200, 200), (64, 48)), ((20, 20), (20, 20))):
-        image = decoded(recording.image(recording.frames[0], input_size))
-        height, width = image.shape[:2]
-        assert (height, width) == shape
+        encoded = recording.image(recording.frames[0], input_size)
+        image, (height, width) = pixels_of(encoded), shape
+        assert (encoded.content_type, image.shape) == ("image/png", (height, width, 3))
         top, lower = image[height // 4], image[3 * height // 4]
         assert top[:, 0].min() > 200, "blue above"
         assert lower[: width // 3, 1].min() > 200, "green at the lower left"
@@ -171,7 +168,7 @@ def test_the_front_camera_is_upright_sky_up_ground_down(real_data, nclt_tree):
     nclt_tree.image_file(nclt_tree.start_us + 500_000, nclt_tree.tiff(stored))
     nclt_tree.truth(nclt_tree.walk_north(1))
     front = open_source(nclt_tree.source)
-    image = decoded(front.image(front.frames[0], None)).astype(float)
+    image = pixels_of(front.image(front.frames[0], None)).astype(float)
     assert image.shape == (1616, 1232, 3)
     top, bottom = image[: 1616 // 3], image[-1616 // 3 :]
     assert top.mean() > 1.2 * bottom.mean(), "the sky is brighter than the ground"
@@ -225,21 +222,16 @@ def test_a_real_drive(real_data, nclt_tree):
 
 
 @pytest.mark.parametrize("ending", ["jpg", "PNG", "tiff"])
-def test_copies_in_another_format_are_read_like_copies_of_another_size(nclt_tree, ending):
-    for utime in fill(nclt_tree, seconds=1):
-        tiff = nclt_tree.root / f"2012-01-22/lb3/Cam5/{utime}.tiff"
+def test_copies_in_another_format_are_read_unless_the_tiff_is_there(nclt_tree, ending):
+    tiffs = [nclt_tree.root / f"2012-01-22/lb3/Cam5/{utime}.tiff" for utime in fill(nclt_tree, seconds=1)]
+    for tiff in tiffs:
         cv2.imwrite(str(tiff.with_suffix(f".{ending}")), cv2.imread(str(tiff)))
-        if ending != "tiff":
-            tiff.unlink()
+    assert open_source(nclt_tree.source).frames[0].name == tiffs[0].name
+    for tiff in tiffs if ending != "tiff" else ():
+        tiff.unlink()
     recording = open_source(nclt_tree.source)
     assert {frame.name.partition(".")[2] for frame in recording.frames} == {ending}
     assert recording.upright(recording.frames[0]).shape == (64, 48, 3)
-
-
-def test_of_a_tiff_and_its_copy_the_tiff_is_read(nclt_tree):
-    (utime, *_) = fill(nclt_tree, seconds=1)
-    cv2.imwrite(str(nclt_tree.root / f"2012-01-22/lb3/Cam5/{utime}.jpg"), np.zeros((4, 6), np.uint8))
-    assert open_source(nclt_tree.source).frames[0].name == f"{utime}.tiff"
 
 
 def test_undistorted_copies_that_stand_upright_already_are_not_turned(nclt_tree):
@@ -284,7 +276,7 @@ def test_nclts_images_anywhere_are_turned_upright_by_name_and_shape(nclt_tree, t
         cv2.imwrite(str(folder / f"{nclt_tree.start_us + 200_000 * place}.png"), stored)
     recording = open_source(str(folder))
     assert recording.remarks
-    pixels = cv2.imdecode(np.frombuffer(bodies_of(recording)[1], np.uint8), cv2.IMREAD_COLOR)
+    pixels = pixels_of(recording.image(recording.frames[1], None))
     assert pixels.shape == upright.shape
     assert np.abs(pixels.astype(int) - upright).mean() < 3
     assert open_source(str(folder), rotate=0).rotate == 0
@@ -298,6 +290,6 @@ def test_a_camera_that_hangs_otherwise_is_turned_as_asked(tmp_path, nclt_tree, d
     image = nclt_tree.picture()
     cv2.imwrite(str(tmp_path / "a.png"), np.rot90(image, degrees // 90))
     recording = open_source(str(tmp_path), rotate=degrees)
-    pixels = cv2.imdecode(np.frombuffer(bodies_of(recording)[0], np.uint8), cv2.IMREAD_COLOR)
+    pixels = pixels_of(recording.image(recording.frames[0], None))
     assert pixels.shape == image.shape
     assert np.abs(pixels.astype(int) - image).mean() < 3

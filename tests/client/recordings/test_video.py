@@ -10,6 +10,8 @@ from deepsimbad_client.http.upload import in_order
 from deepsimbad_client.recordings import video as videos
 from deepsimbad_client.recordings.sources import open_source
 
+from .conftest import pixels_of
+
 
 def filmed(path, codec):
     """Write thirty frames, ten a second; the grey of each is five times its number."""
@@ -26,16 +28,13 @@ def video(tmp_path):
 
 
 def grey(recording, frame):
-    image = recording.image(frame, None)
-    return float(cv2.imdecode(np.frombuffer(image.body, np.uint8), cv2.IMREAD_COLOR).mean())
+    return float(pixels_of(recording.image(frame, None)).mean())
 
 
 def test_a_video_is_its_frames_in_any_order_asked_for(video):
     recording = open_source(f"{video}#3:30:4", spacing_m=2)
-    assert [(frame.name, frame.position_m, frame.timestamp_us) for frame in recording.frames[:2]] == [
-        ("drive.avi/000003", 6, 300_000),
-        ("drive.avi/000007", 14, 700_000),
-    ]
+    first, second = [(frame.name, frame.position_m, frame.timestamp_us) for frame in recording.frames[:2]]
+    assert (first, second) == (("drive.avi/000003", 6, 300_000), ("drive.avi/000007", 14, 700_000))
     for frame in [*recording.frames[::-1], *recording.frames]:
         assert grey(recording, frame) == pytest.approx(5 * int(frame.name[-2:]), abs=2)
     shades = dict(in_order(lambda frame: grey(recording, frame), recording.frames, 4))
@@ -47,21 +46,14 @@ def test_frames_are_taken_by_time_or_by_distance(video):
     assert [(frame.index, frame.name[-2:]) for frame in recording.frames] == [(k, f"{5 * k:02}") for k in range(1, 6)]
     video.with_suffix(".csv").write_text("time_s,x_m,y_m\n0,0,0\n1,0,5\n1.5,0,5\n2.5,0,15\n3,0,20\n")
     recording = open_source(str(video), every_m=5)
-    assert [(frame.name[-2:], round(frame.position_m, 1)) for frame in recording.frames] == [
-        ("00", 0),
-        ("10", 5),
-        ("20", 10),
-        ("25", 15),
-    ]
-    at_us = 1_400_000_000_000_000
-    video.with_suffix(".csv").write_text(
-        f"time,x_m,y_m\n{at_us},0,0\n{at_us + 1_000_000},0,5\n{at_us + 2_900_000},0,9\n"
-    )
+    places_m = {frame.name[-2:]: round(frame.position_m, 1) for frame in recording.frames}
+    assert places_m == {"00": 0, "10": 5, "20": 10, "25": 15}
+    rows = (f"{1_400_000_000_000_000 + after_us},0,{y_m}" for after_us, y_m in ((0, 0), (1_000_000, 5), (2_900_000, 9)))
+    video.with_suffix(".csv").write_text("\n".join(["time,x_m,y_m", *rows]))
     recording = open_source(str(video), time_offset_s=0.5)
     assert [round(recording.frames[number].position_m, 1) for number in (0, 5)] == [2.5, 5]
-    assert recording.left_out_names["before or after the positions"] == [
-        f"drive.avi/0000{number}" for number in range(25, 30)
-    ]
+    late_names = [f"drive.avi/0000{number}" for number in range(25, 30)]
+    assert recording.left_out_names["before or after the positions"] == late_names
     assert "begin together" in recording.remarks[0]
     with pytest.raises(SourceError, match="--every-s"):
         open_source(str(video), every_m=5, every_s=1)
@@ -92,9 +84,8 @@ def with_times(mp4, entries):
 def test_frames_of_a_changing_rate_have_the_times_at_which_they_are_shown(tmp_path):
     path = filmed(tmp_path / "phone.mp4", "mp4v")
     path.write_bytes(with_times(path.read_bytes(), [(10, 1024), (20, 2048)]))  # of 10240 a second
-    path.with_suffix(".CSV").write_text(
-        "time_s,x_m,y_m\n" + "".join(f"{number / 10},{number},0\n" for number in range(80))
-    )
+    rows = (f"{number / 10},{number},0" for number in range(80))
+    path.with_suffix(".CSV").write_text("\n".join(["time_s,x_m,y_m", *rows]))
     recording = open_source(str(path))
     assert [frame.position_m for frame in recording.frames] == pytest.approx([*range(10), *range(10, 30, 2)])
     assert "the file says that it has 30 frames, and 20 can be decoded" in recording.remarks[-1]  # of three seconds
@@ -108,8 +99,7 @@ def test_lines_for_every_frame_place_them(video):
 
 def test_a_camera_that_hangs_upside_down_is_turned(video):
     recording = open_source(str(video), rotate=90)
-    body = recording.image(recording.frames[0], None).body
-    assert cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR).shape == (64, 48, 3)
+    assert pixels_of(recording.image(recording.frames[0], None)).shape == (64, 48, 3)
 
 
 def test_a_video_cut_short_has_broken_frames_and_none_at_all_is_named(video, capfd):
