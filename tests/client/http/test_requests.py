@@ -1,9 +1,7 @@
 """The requests on the wire, and the reading of the answers."""
 
-import ast
 import itertools
 import json
-import subprocess
 import sys
 from io import BytesIO, StringIO
 
@@ -13,8 +11,10 @@ import numpy as np
 import pydantic
 import pytest
 
+from deepsimbad import __main__ as service_script
 from deepsimbad import errors as service_errors
 from deepsimbad_client import Client, RetryPolicy, errors
+from deepsimbad_client import cli as client_script
 from deepsimbad_client.errors import BY_CODE, BY_STATUS, InvalidArgumentError
 from deepsimbad_client.http import RETRIED_STATUSES, media_type_of, observation
 from deepsimbad_client.http.models import Job, Localization
@@ -293,45 +293,34 @@ def test_a_requests_id_is_no_part_of_what_was_answered():
     assert Job.model_validate({**JOB, "_request_id": "theirs", "request_id": "theirs"}).request_id is None
 
 
-def python(code):
-    return subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60)
-
-
-def test_importing_the_client_needs_httpx2_and_pydantic_alone():
-    printed = python(
-        "import sys; before = set(sys.modules)\n"
-        "import deepsimbad_client\n"
-        "print(sorted({name.partition('.')[0] for name in set(sys.modules) - before}))"
-    ).stdout
-    imported = set(ast.literal_eval(printed))
-    assert {"httpx2", "pydantic"} <= imported
-    assert not imported & {"numpy", "cv2", "click", "rich", "matplotlib", "deepsimbad"}
+# The scripts themselves, which load their commands late
 
 
 @pytest.mark.parametrize("absent", ["click", "rich", "numpy", "cv2", "matplotlib"])
-def test_the_script_without_the_extra_says_what_to_install(absent):
-    process = python(
-        f"import sys; sys.modules[{absent!r}] = None; sys.argv = ['', 'domains']\n"
-        "from deepsimbad_client.cli import main\nmain()"
-    )
-    assert process.returncode == 1
-    assert process.stderr == f"{absent} not installed: pip install 'deep-simbad[replay]'\n"
+def test_the_script_without_the_extra_says_what_to_install(absent, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, absent, None)
+    with pytest.raises(SystemExit) as end:
+        client_script.main()
+    assert end.value.code == 1
+    assert capsys.readouterr().err == f"{absent} not installed: pip install 'deep-simbad[replay]'\n"
 
 
 @pytest.mark.parametrize(
-    ("command", "loads", "says"),
+    ("script", "loads", "says"),
     [
-        ("deepsimbad.__main__", "deepsimbad.cli", "cancelled\n"),
-        ("deepsimbad_client.cli", "deepsimbad_client.commands", "deepsimbad-client: cancelled\n"),
+        (service_script, "deepsimbad.cli", "cancelled\n"),
+        (client_script, "deepsimbad_client.commands", "deepsimbad-client: cancelled\n"),
     ],
 )
-def test_a_ctrl_c_while_a_command_is_loaded_is_no_stack(command, loads, says):
-    process = python(
-        "import signal, sys\n"
-        "class CtrlC:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        f"        if name == {loads!r}: signal.raise_signal(signal.SIGINT)\n"
-        "sys.meta_path.insert(0, CtrlC())\n"
-        f"from {command} import main\nmain()"
-    )
-    assert (process.returncode, process.stderr) == (130, says)
+def test_a_ctrl_c_while_a_command_is_loaded_is_no_stack(script, loads, says, monkeypatch, capsys):
+    class CtrlC:
+        def find_spec(self, name, path=None, target=None):
+            if name == loads:
+                raise KeyboardInterrupt
+
+    monkeypatch.setenv("OPENBLAS_THREAD_TIMEOUT", "16")
+    monkeypatch.delitem(sys.modules, loads)
+    monkeypatch.setattr(sys, "meta_path", [CtrlC(), *sys.meta_path])
+    with pytest.raises(SystemExit) as end:
+        script.main()
+    assert (end.value.code, capsys.readouterr().err) == (130, says)
