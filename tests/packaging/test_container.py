@@ -43,10 +43,6 @@ IMAGE_USER: dict[str, Any] = {"user": 10001, "group": 10001, "extra_groups": []}
 
 
 def test_the_image_is_what_it_says_and_runs_without_root(tmp_path):
-    arguments = {name: value for argument in STAGES[""] for name, value in pairs(argument.rest).items()}
-    assert arguments["VARIANT"] == "cpu"
-    assert set(arguments) == {"VARIANT", "PYTHON_IMAGE", "CUDA_IMAGE"}
-    assert list(STAGES) == ["", "base-cpu", "base-cuda", "build", "service"]
     context = context_of(PROJECT, tmp_path / "context")
     copied = {source for copy in STAGES["build"].every("COPY") for source in copy.rest.split()[:-1]}
     assert {path.name for path in context.iterdir()} == copied, "the context holds no more than is copied"
@@ -55,8 +51,6 @@ def test_the_image_is_what_it_says_and_runs_without_root(tmp_path):
     assert FINAL.rest_of("USER") == "10001:10001"
     assert not FINAL.every("RUN"), "the last stage holds what was copied and nothing else"
     assert {copy.options.get("chown") for copy in FINAL.every("COPY")} == {None, "10001:10001"}
-    assert json.loads(FINAL.rest_of("ENTRYPOINT")) == ["/opt/deepsimbad/bin/deepsimbad"]
-    assert json.loads(FINAL.rest_of("CMD")) == ["serve"]
     volume = FINAL.rest_of("VOLUME")
     assert FINAL.rest_of("WORKDIR") == volume
     assert all(ENVIRONMENT[name].startswith(volume) for name in ("DEEPSIMBAD_DATA_DIR", "NUMBA_CACHE_DIR", "HOME"))
