@@ -124,8 +124,8 @@ def test_images_with_a_broken_one_among_them(client, tmp_path, command, ends):
 
 def test_the_command_line_end_to_end(command, out, ends, encodings, tmp_path):
     for name, n_sent in (("landmarks", 60), ("summer", 120)):
-        sent = out("upload", encodings / f"{name}.npy", "--domain", "cli", "--traverse", name, "--json")
-        assert sent["n_sent"] == n_sent
+        report = out("upload", encodings / f"{name}.npy", "--domain", "cli", "--traverse", name, "--json")
+        assert report["n_sent"] == n_sent
     remap_words = ("remap", "--domain", "cli", "--training")
     job = out(*remap_words, "summer", "--landmarks", "landmarks", "--n-landmarks", "50", "--json")
     assert job["result"]["map_version"] == 1

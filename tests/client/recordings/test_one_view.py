@@ -79,7 +79,7 @@ def test_whether_a_view_shows_nothing_does_not_hang_on_who_made_it_small():
 
 
 @contextmanager
-def mapped(data_dir, source):
+def yard_client(data_dir, source):
     """A client of a service whose domain `yard` is mapped from a recording."""
     with serving(data_dir) as url, Client(url) as client:
         client.admin.put_domain("yard", EVALUATOR)
@@ -109,8 +109,8 @@ def test_a_view_has_one_answer_by_every_route(tmp_path):
         cv2.imwrite(str(drive / f"{place:02}.png"), scene(100 + place))
     for number, form in enumerate(("jpg", "png", "tiff")):
         cv2.imwrite(str(looks / f"{number}.{form}"), cv2.convertScaleAbs(scene(103 + 3 * number), alpha=0.8, beta=15))
-    paths, here = sorted(looks.iterdir()), {"DEEPSIMBAD_DATA_DIR": str(data_dir)}
-    with mapped(data_dir, drive) as client:
+    paths, environment = sorted(looks.iterdir()), {"DEEPSIMBAD_DATA_DIR": str(data_dir)}
+    with yard_client(data_dir, drive) as client:
         by_python = [client.localize("yard", path).model_dump(mode="json") for path in paths]
         eyes = client.on_board("yard")
         by_ranks = [client.localize("yard", on_board=eyes.ranks(path, m=8)) for path in paths]
@@ -121,8 +121,8 @@ def test_a_view_has_one_answer_by_every_route(tmp_path):
         ]
         assert run_command(["deepsimbad-client", "localize", "yard", "--server", client.url]).code == 2
     make = ["deepsimbad", "map", "own", "--training", drive, "--evaluator", "feature_l2:gradient_grid"]
-    assert run_command([*make, "--n-landmarks", "8"], **here).code == 0
-    answers += [printed("deepsimbad", domain, *paths, **here)[0] for domain in ("yard", "own")]
+    assert run_command([*make, "--n-landmarks", "8"], **environment).code == 0
+    answers += [printed("deepsimbad", domain, *paths, **environment)[0] for domain in ("yard", "own")]
     assert [expected["belief"]["mode_m"] for expected in by_python] == [3, 6, 9], "else nothing is shown"
     for other in answers:
         for part in ("belief", "retrieval", "informative"):
@@ -159,7 +159,7 @@ def test_a_raw_image_of_nclt_has_one_answer_by_every_route(tmp_path):
         "camera's folder": [f"{looks}#2:5"],
         "folder": [f"{loose}#2:5"],
     }
-    with mapped(data_dir, f"nclt:{tmp_path}/nclt/2012-01-08") as client:
+    with yard_client(data_dir, f"nclt:{tmp_path}/nclt/2012-01-08") as client:
         answers = {"Python": [client.localize("yard", path).model_dump(mode="json") for path in paths]}
         with client.session("yard") as session:
             in_session = session.observe(paths[0])
@@ -192,7 +192,7 @@ def test_views_of_more_than_eight_bits_are_shown_as_their_map_was(tmp_path):
     sunny[:12, :60] = 4000  # which would change the levels of the picture alone
     cv2.imwrite(str(look), sunny)
     image, levels = look.read_bytes(), open_source(str(drive)).grey_levels
-    with mapped(data_dir, drive) as client:
+    with yard_client(data_dir, drive) as client:
         stored = client.admin.traverse("yard", "t")
         assert (stored.grey_levels, stored.n_uninformative) == (levels, 1)
         assert upload(client, open_source(f"{drive}#3:6"), "yard", "t").n_skipped == 3

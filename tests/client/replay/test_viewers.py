@@ -104,12 +104,12 @@ def test_rerun_is_sent_the_route_the_belief_the_images_and_the_next_move(replaye
 
 
 @pytest.mark.parametrize(
-    ("words", "module", "needed"),
+    ("words", "module", "library"),
     [(["--rerun"], "rerun", "Rerun's viewer"), (["--mcap", "x.mcap"], "mcap.writer", "the library mcap")],
     ids=["rerun", "mcap"],
 )
-def test_without_the_library_one_line_says_what_to_install(replayed, monkeypatch, words, module, needed):
+def test_without_the_library_one_line_says_what_to_install(replayed, monkeypatch, words, module, library):
     monkeypatch.setitem(sys.modules, module, None)
     option = words[0]
     install = f"pip install 'deep-simbad[{option.strip('-')}]'"
-    assert replayed("out", *words).line == f"deepsimbad-client: missing_extra: {option} needs {needed}: {install}"
+    assert replayed("out", *words).line == f"deepsimbad-client: missing_extra: {option} needs {library}: {install}"
