@@ -10,9 +10,10 @@ import socket
 import ssl
 import subprocess
 import sys
-import time
+from contextlib import suppress
 from pathlib import Path
 
+import httpx2
 import pytest
 import uvicorn
 from fastapi import FastAPI
@@ -20,6 +21,8 @@ from fastapi import FastAPI
 from deepsimbad.api.server import JsonFormatter, PlainFormatter, _Server, configure_logging, serve
 from deepsimbad.errors import SettingsError, UnavailableError
 from deepsimbad.settings import Settings
+from tests.contract.conftest import wait_until
+from tests.fork_server import Popen
 
 FILES = Path(__file__).parent / "tls"
 pytestmark = pytest.mark.usefixtures("_logging_as_before")
@@ -63,30 +66,25 @@ def test_a_certificate_that_cannot_be_used(tmp_path, certificate, key):
 def test_the_service_on_https(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", tmp_path, "--port", str(port)],
-        env={**os.environ, "DEEPSIMBAD_TLS_CERTIFICATE": str(CERTIFICATE), "DEEPSIMBAD_TLS_KEY": str(KEY)},
-        stderr=subprocess.DEVNULL,
-        cwd=tmp_path,
-    )
     context = ssl.create_default_context(cafile=CERTIFICATE)
-    answer = b""
-    try:
-        for _ in range(600):
-            try:
-                with (
-                    socket.create_connection(("127.0.0.1", port), timeout=20) as connection,
-                    context.wrap_socket(connection, server_hostname="localhost") as secured,
-                ):
-                    secured.sendall(b"GET /readyz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-                    answer = secured.recv(65536)
-                    break
-            except OSError:
-                time.sleep(0.1)
-        assert answer.startswith(b"HTTP/1.1 200 ")
-    finally:
-        process.kill()
-        process.wait()
+    with (
+        Popen(
+            [sys.executable, "-m", "deepsimbad", "serve", "--create", "--data-dir", tmp_path, "--port", str(port)],
+            env={**os.environ, "DEEPSIMBAD_TLS_CERTIFICATE": str(CERTIFICATE), "DEEPSIMBAD_TLS_KEY": str(KEY)},
+            stderr=subprocess.DEVNULL,
+            cwd=tmp_path,
+        ) as process,
+        httpx2.Client(base_url=f"https://localhost:{port}", verify=context, timeout=60, trust_env=False) as client,
+    ):
+
+        def is_ready():
+            with suppress(httpx2.TransportError):
+                return client.get("/readyz").status_code == 200
+
+        try:
+            wait_until(is_ready)
+        finally:
+            process.kill()
 
 
 def test_what_is_there_at_the_start_is_not_looked_through_again():

@@ -25,6 +25,7 @@ NPZ = {"Content-Type": "application/octet-stream"}
 JSON = {"Content-Type": "application/json"}
 JPEG = {"Content-Type": "image/jpeg"}
 TAKES_ENCODINGS = {"evaluator": {"kind": "feature_l2", "extractor": "none"}}
+TAKES_IMAGES = {"evaluator": {"kind": "feature_l2"}}
 NAMES = {"domain": "ready", "name": "drive", "index": "0", "version": "1", "session_id": "none", "job_id": "none"}
 IS_FLEET = "TEST_FLEET" in os.environ
 of_one_process = pytest.mark.skipif(IS_FLEET, reason="looks into the process that answers")
@@ -80,6 +81,11 @@ def encoded(image, extension=".jpg"):
     return body.tobytes()
 
 
+def image_body(image, kind="jpeg"):
+    """The body and the header of a request that brings an image."""
+    return {"content": encoded(image, f".{kind}"), "headers": {"Content-Type": f"image/{kind}"}}
+
+
 def ready_encodings():
     return np.random.default_rng(5).normal(size=(N_READY, DIM)).astype(np.float32)
 
@@ -98,8 +104,25 @@ def operations(document):
             yield method.upper(), f"{path}?{query}", json.dumps(example).encode(), kind
 
 
+def body_of(view):
+    """The body of a request that brings a view: an image's, else JSON."""
+    return view if "content" in view else {"json": view}
+
+
 class Caller(httpx2.Client):
     """The calls that many tests make; each checks that it was answered well."""
+
+    def answer_to(self, method, path, **request):
+        """The document of the answer to a request that is not refused."""
+        answer = self.request(method, path, **request)
+        assert answer.is_success, answer.text
+        return answer.json()
+
+    def localize(self, domain="ready", view=RANKS, **query):
+        return self.answer_to("POST", f"/v1/domains/{domain}/localizations", params=query, **body_of(view))
+
+    def observe(self, session_path, view=RANKS, **query):
+        return self.answer_to("POST", f"{session_path}/observations", params=query, **body_of(view))
 
     def wait_for(self, job_id):
         """A job when it has ended."""
@@ -118,6 +141,18 @@ class Caller(httpx2.Client):
         assert answer.status_code == 202, answer.text
         return self.wait_for(answer.json()["job_id"])
 
+    def make_map(self, domain, **config):
+        """A remap's job, which succeeds."""
+        job = self.remap(domain, **config)
+        assert job["state"] == "succeeded", job
+        return job
+
+    def make_domain(self, name, **domain):
+        """A new domain, of ready encodings unless it is said otherwise, without a map."""
+        answer = self.put(f"/v1/admin/domains/{name}", json={**TAKES_ENCODINGS, **domain})
+        assert answer.status_code == 201, answer.text
+        return answer.json()
+
     def upload(self, domain, name, encodings, position_m, /, **columns):
         base = f"/v1/admin/domains/{domain}/traverses"
         assert self.post(base, json={"name": name}).status_code == 201
@@ -130,20 +165,17 @@ class Caller(httpx2.Client):
         frames = f"/v1/admin/domains/{domain}/traverses/{name}/frames"
         self.post(f"/v1/admin/domains/{domain}/traverses", json={"name": name})
         return [
-            self.put(
-                f"{frames}/{n}?position_m={n}&name=Stra%C3%9Fe%20{n}.png", content=encoded(picture(n)), headers=JPEG
-            ).status_code
+            self.put(f"{frames}/{n}?position_m={n}&name=Stra%C3%9Fe%20{n}.png", **image_body(picture(n))).status_code
             for n in range(N_SEEN)
         ]
 
     def make_ready_domain(self, name, **domain):
-        assert self.put(f"/v1/admin/domains/{name}", json={**TAKES_ENCODINGS, **domain}).status_code == 201
+        self.make_domain(name, **domain)
         n = np.arange(N_READY)
         x_m = np.where(n == 3, np.nan, 2.0 * n)
         names = np.array(["" if image == 3 else f"{image}.png" for image in n])
         self.upload(name, "drive", ready_encodings(), 2.0 * n, timestamp_us=n, x_m=x_m, y_m=-1.0 * n, name=names)
-        job = self.remap(name, landmark_traverse="drive", n_landmarks=N_LANDMARKS, list_length=4)
-        assert job["state"] == "succeeded", job
+        self.make_map(name, landmark_traverse="drive", n_landmarks=N_LANDMARKS, list_length=4)
 
     def begin(self, domain="ready", **body):
         """A new session as it is answered."""
@@ -214,11 +246,10 @@ def client(data_dir):
     """Shared by all tests of a run: a test that changes a domain makes its own."""
     with service(data_dir) as client:
         client.make_ready_domain("ready")
-        assert client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
+        for name in ("seen", "unmapped"):
+            client.make_domain(name, **TAKES_IMAGES)
         assert client.upload_pictures("seen", "drive") == [201] * N_SEEN
-        job = client.remap("seen", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3)
-        assert job["state"] == "succeeded", job
-        client.put("/v1/admin/domains/unmapped", json={"evaluator": {"kind": "feature_l2"}})
+        client.make_map("seen", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3)
         yield client
 
 

@@ -1,4 +1,4 @@
-"""`deepsimbad serve` as a process of its own, a robot that uses it all along, and what it costs in memory."""
+"""`deepsimbad serve` as a process of its own, requests to it, a robot that uses it all along, and what it costs."""
 
 import contextlib
 import http.client
@@ -15,11 +15,14 @@ import numpy as np
 
 from deepsimbad_client.http.local_server import LocalServer
 
-from .conftest import IS_FLEET, wait_until
+from .conftest import IS_FLEET, Caller, wait_until
 
 
 class ServerProcess(LocalServer):
-    """The process; a `program`, run in place of the command, gets the data directory first and the port last."""
+    """The process, and `client`, who asks it while it is up.
+
+    A `program`, run in place of the command, gets the data directory first and the port last.
+    """
 
     def __init__(self, data_dir, program=None, **settings):
         variables = {f"DEEPSIMBAD_{name.upper()}": str(value) for name, value in settings.items()}
@@ -29,6 +32,19 @@ class ServerProcess(LocalServer):
         elif IS_FLEET:
             options = ["--replicas", "2", "--data-dir", str(data_dir), "--map-store", f"file://{data_dir}-store"]
             self.command = [sys.executable, "-m", "deepsimbad", "ray", "serve", *options]
+        self.client = self._caller()
+
+    def _caller(self):
+        return Caller(base_url=self.url, timeout=120, trust_env=False)
+
+    def start(self):
+        self.client.close()  # and with it connections to the process that was
+        self.client = self._caller()
+        super().start()
+
+    def kill(self):
+        super().kill()
+        self.client.close()
 
     def connect(self):
         return socket.create_connection(("127.0.0.1", self.port), timeout=120)

@@ -15,11 +15,12 @@ from deepsimbad.store import catalog
 
 from .conftest import (
     DIM,
-    JPEG,
     NPZ,
     RANKS,
     TAKES_ENCODINGS,
+    TAKES_IMAGES,
     encoded,
+    image_body,
     npz,
     of_one_process,
     path_of,
@@ -40,8 +41,7 @@ def test_a_domain_is_made_once(client):
     assert (first.status_code, repetition.status_code) == (201, 200)
     assert first.json() == repetition.json() == client.get("/v1/domains/once").json()
     assert first.json()["actions_m"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
-    answer = client.put("/v1/admin/domains/defaults", json={"evaluator": {"kind": "feature_l2"}})
-    written_out = {"evaluator": answer.json()["evaluator"]}
+    written_out = {"evaluator": client.make_domain("defaults", **TAKES_IMAGES)["evaluator"]}
     assert client.put("/v1/admin/domains/defaults", json=written_out).status_code == 200
 
 
@@ -78,6 +78,10 @@ def test_a_domain_whose_folder_cannot_be_removed_is_gone_with_its_sessions(clien
 
 # Traverses
 
+EMPTY = dict.fromkeys(("length_m", "span_us", "digest", "grey_levels"))
+EMPTY |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0, "n_spooled": 0}
+EMPTY |= {"spooled_bytes": 0, "cameras": [], "warnings": []}
+
 
 @pytest.fixture
 def shelf(client, request):
@@ -85,10 +89,7 @@ def shelf(client, request):
     base = f"/v1/admin/domains/{request.node.name.replace('_', '-')[:60]}"
     client.put(base, json=TAKES_ENCODINGS)
     answer = client.post(f"{base}/traverses", json={"name": "t"})
-    empty = dict.fromkeys(("length_m", "span_us", "digest", "grey_levels"))
-    empty |= {"name": "t", "n_frames": 0, "missing": [], "n_uninformative": 0, "n_spooled": 0}
-    empty |= {"spooled_bytes": 0, "cameras": [], "warnings": []}
-    assert (answer.status_code, answer.json()) == (201, empty)
+    assert (answer.status_code, answer.json()) == (201, EMPTY)
     return f"{base}/traverses"
 
 
@@ -116,20 +117,9 @@ def test_frames_twice_and_out_of_order(client, shelf):
         answers.append((answer.status_code, answer.json()["index"], answer.json()["n_frames"]))
     assert answers == [(201, 5, 1), (201, 0, 2), (201, 2, 3), (200, 5, 3)]
     description = client.get(f"{shelf}/t").json()
-    assert len(description.pop("digest")) == 64
-    assert description == {
-        "name": "t",
-        "n_frames": 3,
-        "missing": [[1, 1], [3, 4]],
-        "length_m": 5.0,
-        "span_us": [0, 5],
-        "n_uninformative": 0,
-        "n_spooled": 0,
-        "spooled_bytes": 0,
-        "grey_levels": None,
-        "cameras": [],
-        "warnings": [],
-    }
+    assert len(description["digest"]) == 64
+    told_by_frames = {"n_frames": 3, "missing": [[1, 1], [3, 4]], "length_m": 5.0, "span_us": [0, 5]}
+    assert description == {**EMPTY, **told_by_frames, "digest": description["digest"]}
     batch = npz(encodings=np.ones((3, DIM)), index=np.array([4, 2, 3]), position_m=np.array([4, 2, 3]))
     answer = client.post(f"{shelf}/t/frames", content=batch, headers=NPZ)
     assert (answer.status_code, answer.json()) == (200, {"n_new": 2, "n_replaced": 1, "n_frames": 5})
@@ -152,41 +142,33 @@ def test_what_is_there_stays_where_nothing_may_be_replaced(client, shelf):
         ({"encodings": np.eye(DIM)[[3, 1, 2]]}, [0], "content"),
     ):
         batch = npz(**{**frames_there, "index": np.arange(3), **changes})
-        response = problem(client.post(f"{frames}?replace=false", content=batch, headers=NPZ), 409, "frames_differ")
-        assert (response["indices"], response["n_differing"]) == (indices, len(indices))
-        assert f"differ in {difference}," in response["detail"]
-    response = client.put(f"{frames}/1?position_m=4&replace=false", json=encoding)
-    assert problem(response, 409, "frames_differ")["indices"] == [1]
+        refusal = problem(client.post(f"{frames}?replace=false", content=batch, headers=NPZ), 409, "frames_differ")
+        assert (refusal["indices"], refusal["n_differing"]) == (indices, len(indices))
+        assert f"differ in {difference}," in refusal["detail"]
+    answer = client.put(f"{frames}/1?position_m=4&replace=false", json=encoding)
+    assert problem(answer, 409, "frames_differ")["indices"] == [1]
     assert client.get(f"{shelf}/t").json() == description
+    digests = (hashlib.blake2b(row.astype("<f4").tobytes(), digest_size=8).digest() for row in np.eye(DIM)[:3])
     with np.load(BytesIO(client.get(frames).content)) as columns:
-        assert {name: columns[name].tolist() for name in ("index", "position_m", "timestamp_us")} == {
-            "index": [0, 1, 2],
-            "position_m": [0, 1, 2],
-            "timestamp_us": [-1] * 3,
-        }
+        assert columns["index"].tolist() == columns["position_m"].tolist() == [0, 1, 2]
+        assert columns["timestamp_us"].tolist() == [-1] * 3
         assert np.isnan([columns["x_m"], columns["y_m"]]).all()
-        assert columns["content_digest"].tolist() == [
-            int.from_bytes(hashlib.blake2b(row.astype("<f4").tobytes(), digest_size=8).digest(), "little")
-            for row in np.eye(DIM)[:3]
-        ]
+        assert columns["content_digest"].tolist() == [int.from_bytes(digest, "little") for digest in digests]
 
 
 @pytest.mark.parametrize("dim", [64, 4096])
 def test_a_domain_of_images_takes_ready_encodings_of_any_one_length(client, dim):
     name = f"any-{dim}"
-    client.put(f"/v1/admin/domains/{name}", json={"evaluator": {"kind": "feature_l2"}})
+    client.make_domain(name, **TAKES_IMAGES)
     encodings = np.random.default_rng(dim).integers(-9, 10, (20, dim)).astype(np.float16)
     client.upload(name, "drive", encodings, np.arange(20))
-    image = {"content": encoded(picture(1)), "headers": JPEG}
+    image = image_body(picture(1))
     answer = client.put(f"/v1/admin/domains/{name}/traverses/drive/frames/20?position_m=20", **image)
     assert str(dim) in problem(answer, 422, "invalid_encoding")["detail"]
-    job = client.remap(name, landmark_traverse="drive", n_landmarks=20)
-    assert job["state"] == "succeeded", job
-    localizations = f"/v1/domains/{name}/localizations"
-    assert client.post(localizations, json={"ranked_landmarks": [7, 3, 11]}).json()["retrieval"]
-    retrieval = client.post(localizations, json={"encoding": encodings[13].tolist()}).json()["retrieval"]
-    assert retrieval[0]["map_image"] == 13
-    detail = problem(client.post(localizations, **image), 422, "invalid_encoding")["detail"]
+    client.make_map(name, landmark_traverse="drive", n_landmarks=20)
+    assert client.localize(name, {"ranked_landmarks": [7, 3, 11]})["retrieval"]
+    assert client.localize(name, {"encoding": encodings[13].tolist()})["retrieval"][0]["map_image"] == 13
+    detail = problem(client.post(f"/v1/domains/{name}/localizations", **image), 422, "invalid_encoding")["detail"]
     assert f"landmarks of {dim}" in detail
 
 
@@ -199,49 +181,52 @@ def test_an_image_and_its_encoding_are_the_same_frame(client):
 
 
 def test_drives_of_two_cameras_are_told_from_upload_to_remap(client):
-    base = "/v1/admin/domains/cameras"
-    client.put(base, json={"evaluator": {"kind": "feature_l2", "extractor": "gradient_grid"}})
-    for name, turn in (("upright", None), ("lying", cv2.ROTATE_90_CLOCKWISE)):
-        client.post(f"{base}/traverses", json={"name": name})
+    """What is asked after a job depends on the map that it has made."""
+    traverses = "/v1/admin/domains/cameras/traverses"
+    client.make_domain("cameras", evaluator={"kind": "feature_l2", "extractor": "gradient_grid"})
+
+    def warning_of(document):
+        (warning,) = document["warnings"]
+        return warning
+
+    def warnings_of_remap(**config):
+        return client.make_map("cameras", n_landmarks=8, **config)["result"]["metrics"]["warnings"]
+
+    def lying_picture(n):
+        return image_body(cv2.rotate(picture(n), cv2.ROTATE_90_CLOCKWISE))
+
+    for name, body_of_picture in (("upright", lambda n: image_body(picture(n))), ("lying", lying_picture)):
+        client.post(traverses, json={"name": name})
         for n in range(8):
-            view = encoded(picture(n) if turn is None else cv2.rotate(picture(n), turn))
-            path = f"{base}/traverses/{name}/frames/{n}?position_m={n}&x_m={n}&y_m=0&camera=Cam5"
-            assert client.put(path, content=view, headers=JPEG).status_code == 201
-    upright, lying = (client.get(f"{base}/traverses/{name}").json() for name in ("upright", "lying"))
+            path = f"{traverses}/{name}/frames/{n}?position_m={n}&x_m={n}&y_m=0&camera=Cam5"
+            assert client.put(path, **body_of_picture(n)).status_code == 201
+    upright, lying = (client.get(f"{traverses}/{name}").json() for name in ("upright", "lying"))
     assert upright["cameras"] == [
         {"name": "Cam5", "width": 160, "height": 120, "aspect_ratio": 4 / 3, "orientation": "landscape"}
     ]
     assert (lying["cameras"][0]["width"], lying["cameras"][0]["orientation"]) == (120, "portrait")
     encoding = {"encoding": [0.5] * client.get("/v1/domains/cameras").json()["encoding_dim"]}
-    problem(
-        client.put(f"{base}/traverses/upright/frames/9?position_m=9&camera=Cam5", json=encoding), 422, "invalid_input"
-    )
-    (warning,) = lying["warnings"]
-    assert warning.startswith("its pictures are not like those of traverse upright: they lie on their side")
-    client.put(f"{base}/traverses/upright/frames/8?position_m=8", content=view, headers=JPEG)
-    traverses = client.get(f"{base}/traverses").json()["traverses"]
-    (mixed,) = (traverse["warnings"] for traverse in traverses if traverse["name"] == "upright")
-    assert len(mixed) == 1
-    assert mixed[0].startswith(
+    answer = client.put(f"{traverses}/upright/frames/9?position_m=9&camera=Cam5", json=encoding)
+    problem(answer, 422, "invalid_input")
+    assert warning_of(lying).startswith("its pictures are not like those of traverse upright: they lie on their side")
+    client.put(f"{traverses}/upright/frames/8?position_m=8", **lying_picture(7))
+    (mixed,) = (row for row in client.get(traverses).json()["traverses"] if row["name"] == "upright")
+    assert warning_of(mixed).startswith(
         "some of its pictures are not like the others: they lie on their side: they are 120 x 160"
     )
-    job = client.remap("cameras", training_traverse="upright", n_landmarks=8)
-    assert job["result"]["metrics"]["warnings"] == []
-    lying_view = {"content": encoded(cv2.rotate(picture(1), cv2.ROTATE_90_CLOCKWISE)), "headers": JPEG}
-    observations = f"/v1/sessions/{client.begin('cameras')['session_id']}/observations"
-    for path in ("/v1/domains/cameras/localizations", observations):
-        (warning,) = client.post(path, **lying_view).json()["warnings"]
-        assert warning.startswith("the view's pixels are not like the map's: they lie on their side")
-    job_of_both = client.remap("cameras", training_traverse="upright", landmark_traverse="lying", n_landmarks=8)
-    season_warning, warning = job_of_both["result"]["metrics"]["warnings"]
+    assert warnings_of_remap(training_traverse="upright") == []
+    for answer in (
+        client.localize("cameras", lying_picture(1)),
+        client.observe(client.session("cameras"), lying_picture(1)),
+    ):
+        assert warning_of(answer).startswith("the view's pixels are not like the map's: they lie on their side")
+    season_warning, warning = warnings_of_remap(training_traverse="upright", landmark_traverse="lying")
     assert season_warning.startswith("it learnt nothing of a second season: the two drives share 8 places")
-    assert warning.startswith(
-        "the pictures of traverse lying are not like those of traverse upright: they lie on their"
-    )
-    append_job = client.remap("cameras", training_traverse="lying", append=True, n_landmarks=8)
-    (warning,) = append_job["result"]["metrics"]["warnings"]
-    assert warning.startswith("the pictures of traverse lying are not like those of the active map: they lie on their")
-    warnings = client.post("/v1/domains/cameras/localizations", **lying_view).json()["warnings"]
+    beginning = "the pictures of traverse lying are not like those of"
+    assert warning.startswith(f"{beginning} traverse upright: they lie on their")
+    (warning,) = warnings_of_remap(training_traverse="lying", append=True)
+    assert warning.startswith(f"{beginning} the active map: they lie on their")
+    warnings = client.localize("cameras", lying_picture(1))["warnings"]
     assert not any("pixels" in warning for warning in warnings), "such pictures are in the map by now"
 
 
@@ -257,7 +242,7 @@ def test_what_a_job_needs_is_not_deleted(client, domain):
         problem(client.delete(place), 409, "traverse_in_use")
     assert client.delete(f"/v1/admin/jobs/{job.job_id}").status_code == 204
     assert client.delete(f"{base}/traverses/drive").status_code == 204
-    assert client.post(f"/v1/domains/{domain}/localizations", json=RANKS).status_code == 200
+    client.localize(domain)
     assert client.delete(base).status_code == 204
 
 
@@ -336,8 +321,7 @@ def test_a_remap_asked_for_twice_under_one_key_is_one(tmp_path):
 def test_experience_fed_back_twice_under_one_key_is_learnt_once(client, domain):
     session = client.begin(domain)
     for image in range(0, 8, 2):
-        body = {"encoding": ready_encodings()[image].tolist()}
-        assert client.post(f"{path_of(session)}/observations?action_m=4", json=body).status_code == 200
+        client.observe(path_of(session), {"encoding": ready_encodings()[image].tolist()}, action_m=4)
     truths = {"session_id": session["session_id"], "true_positions_m": [0.0, 4.0, None, 12.0]}
     first = ask(client, "experience", truths, domain=domain)
     assert first.status_code == 202, first.text

@@ -17,6 +17,7 @@ from .conftest import (
     JSON,
     N_LANDMARKS,
     N_READY,
+    N_SEEN,
     NAMES,
     NPZ,
     RANKS,
@@ -33,8 +34,12 @@ ADMIN = "/v1/admin/domains/ready"
 FRAMES = f"{ADMIN}/traverses/drive/frames"
 FRAME = f"{FRAMES}/0?position_m=1"
 BAD = "/v1/admin/domains/bad"
+SESSIONS, REMAPS, UNMAPPED = f"{READY}/sessions", f"{ADMIN}/remaps", "/v1/domains/unmapped"
+OF_A_MAP = ("landmark-model", "landmarks", "coverage")
 KIND = {"kind": "feature_l2"}
+NESTED_KIND = '{"evaluator": {"x": %s}}' % ("[" * 9000)
 REMAP = {"training_traverse": "drive"}
+NO_BODY = (None,)
 
 
 @pytest.fixture(autouse=True)
@@ -185,40 +190,12 @@ def test_idempotency_keys_that_cannot_be(client, key):
     session = client.session()
     for path, body in (
         (f"{session}/observations", RANKS),
-        (f"{READY}/sessions", {}),
-        (f"{ADMIN}/remaps", {"training_traverse": "drive"}),
+        (SESSIONS, {}),
+        (REMAPS, {"training_traverse": "drive"}),
         (f"{ADMIN}/experience", {"session_id": "a", "true_positions_m": [1]}),
     ):
         problem(client.post(path, json=body, headers={"Idempotency-Key": key}), 422, "invalid_request")
     assert client.get(session).json()["n_observations"] == 0
-
-
-def test_bodies_that_cannot_be(client):
-    for method, path, code, bodies in (
-        ("POST", f"{READY}/sessions", "invalid_prior", ('{"start_position_m": NaN}', '{"start_position_m": 1e999}')),
-        ("POST", f"{READY}/sessions", "invalid_prior", ({"start_position_m": 500}, {"start_std_m": 0})),
-        ("POST", f"{READY}/sessions", "invalid_input", ({"planner": "clever"}, {"planner": "constant:3.5"})),
-        ("POST", f"{READY}/sessions", "empty_body", (b"",)),
-        (
-            "PUT",
-            BAD,
-            "invalid_request",
-            ({}, '{"evaluator": {"\\ud800": 1}}', '{"evaluator": {"x": %s}}' % ("[" * 9000)),
-        ),
-        ("PUT", BAD, "invalid_input", ({"evaluator": {}}, {"evaluator": {"kind": "telepathy"}})),
-        ("PUT", BAD, "invalid_input", ({"evaluator": {**KIND, "extractor": "magic"}}, {"evaluator": {**KIND, "a": 1}})),
-        ("PUT", BAD, "invalid_request", ({"evaluator": KIND, "actions_m": list(range(1, 100))},)),
-        ("PUT", FRAME, "invalid_encoding", ({"encoding": [1.0]}, '{"encoding": [NaN]}')),
-        ("PUT", FRAME, "invalid_request", ({"ranked_landmarks": [1]},)),
-        ("PUT", FRAME, "empty_body", (b"",)),
-        ("PUT", FRAME.replace("ready", "seen"), "invalid_encoding", ({"encoding": [1.0, 2.0]},)),
-        ("POST", f"{ADMIN}/remaps", "invalid_map_config", ({**REMAP, "n_landmarks": 10, "list_length": 11},)),
-        ("POST", f"{ADMIN}/remaps", "invalid_map_config", ({**REMAP, "check_traverse": "drive"},)),
-        ("POST", f"{ADMIN}/remaps", "invalid_map_config", ({**REMAP, "append": True, "landmark_traverse": "drive"},)),
-    ):
-        for body in bodies:
-            problem(ask(client, method, path, body), 422, code)
-    assert client.get("/v1/domains/bad").status_code == 404
 
 
 STRANGE = {"unknown": "1"}
@@ -227,22 +204,18 @@ STRANGE = {"unknown": "1"}
 @pytest.mark.parametrize(
     ("method", "path", "base", "wrong"),
     [
-        ("POST", f"{READY}/sessions", {}, STRANGE | {"start_position_m": '"here"', "seed": "-1 1.5", "planner": '""'}),
-        ("POST", f"{READY}/sessions", {}, dict.fromkeys(["belief", "update"], '"guess"')),
-        ("POST", f"{READY}/sessions", {}, {"price_bits_per_m": '-0.1 100.1 NaN 1e999 "1" true'}),
-        ("POST", f"{READY}/sessions", {}, {"confidence": '0 1 -0.5 2 NaN "0.9" true'}),
+        ("POST", SESSIONS, {}, STRANGE | {"start_position_m": '"here"', "seed": "-1 1.5", "planner": '""'}),
+        ("POST", SESSIONS, {}, dict.fromkeys(["belief", "update"], '"guess"')),
+        ("POST", SESSIONS, {}, {"price_bits_per_m": '-0.1 100.1 NaN 1e999 "1" true'}),
+        ("POST", SESSIONS, {}, {"confidence": '0 1 -0.5 2 NaN "0.9" true'}),
         ("PUT", BAD, {"evaluator": KIND}, STRANGE | {"closed": '"perhaps"', "actions_m": "[] [2,1] [1,1]"}),
-        (
-            "PUT",
-            BAD,
-            {"evaluator": KIND},
-            {"actions_m": '[0] [-0.0] [NaN] [1e999] [-1e4] [1e9] [null] [true] ["1"] [0,-5]'},
-        ),
+        ("PUT", BAD, {"evaluator": KIND}, {"actions_m": '[0] [-0.0] [NaN] [1e999] [-1e4] [1e9] [null] [true] ["1"]'}),
+        ("PUT", BAD, {"evaluator": KIND}, {"actions_m": "[0,-5]"}),
         ("POST", f"{ADMIN}/traverses", {}, STRANGE | {"name": '"" "../x" 3 "a\\n"'}),
-        ("POST", f"{ADMIN}/remaps", REMAP, STRANGE | {"list_length": "0", "n_landmarks": "0 65536", "seed": "-1 1.5"}),
-        ("POST", f"{ADMIN}/remaps", REMAP, {"training_episodes": "-1", "activate": '"yes"', "relevance": '"magic"'}),
-        ("POST", f"{ADMIN}/remaps", REMAP, dict.fromkeys(["landmark_traverse", "check_traverse"], '"../drive"')),
-        ("POST", f"{ADMIN}/remaps", REMAP, {"append": "1", "gate_margin": '-1 "1"', "same_route": '"yes" 1'}),
+        ("POST", REMAPS, REMAP, STRANGE | {"list_length": "0", "n_landmarks": "0 65536", "seed": "-1 1.5"}),
+        ("POST", REMAPS, REMAP, {"training_episodes": "-1", "activate": '"yes"', "relevance": '"magic"'}),
+        ("POST", REMAPS, REMAP, dict.fromkeys(["landmark_traverse", "check_traverse"], '"../drive"')),
+        ("POST", REMAPS, REMAP, {"append": "1", "gate_margin": '-1 "1"', "same_route": '"yes" 1'}),
         ("PUT", f"{ADMIN}/active-map", {}, STRANGE | {"version": '0 "1"'}),
     ],
 )
@@ -251,35 +224,20 @@ def test_members_that_cannot_be(client, method, path, base, wrong):
     for member, values in wrong.items():
         for value in values.split():
             body = json.dumps(base)[:-1] + (", " if base else "") + f'"{member}": {value}}}'
-            problem(ask(client, method, path, body), 422, "invalid_request")
+            answer = problem(ask(client, method, path, body), 422, "invalid_request")
+            assert value != "NaN" or f"{member}: Input should be a finite number" in answer["detail"]
     assert client.get("/v1/domains/bad").status_code == 404
 
 
 def test_places_of_frames_that_cannot_be(client):
-    queries = [f"position_m={wrong}" for wrong in ("nan", "inf", "-Infinity", "1e999", "x", "1e200")]
-    queries += [f"position_m=1&{wrong}" for wrong in ("x_m=-1e200", "y_m=1.1e9", "x_m=nan", "y_m=inf")]
-    queries += [f"position_m=1&timestamp_us={wrong}" for wrong in ("-1", "1.5", 10**30)]
-    paths = [f"0?{query}" for query in ("", *queries)]
-    paths += [f"{index}?position_m=1" for index in ("-1", "1.5", "x", 10**30, "%00")]
-    for path in paths:
+    for path in (
+        *(f"0?position_m={wrong}" for wrong in ("nan", "inf", "-Infinity", "1e999", "x", "1e200")),
+        *(f"0?position_m=1&{wrong}" for wrong in ("x_m=-1e200", "y_m=1.1e9", "x_m=nan", "y_m=inf")),
+        *(f"0?position_m=1&timestamp_us={wrong}" for wrong in ("-1", "1.5", 10**30)),
+        *(f"{index}?position_m=1" for index in ("-1", "1.5", "x", 10**30, "%00")),
+        "0?",
+    ):
         problem(client.put(f"{FRAMES}/{path}", json={"encoding": [1.0] * DIM}), 422, "invalid_request")
-
-
-@pytest.mark.parametrize(
-    "body", [{"position_m": 1e6, "std_m": 1}, {"position_m": 1, "std_m": 0}, {"position_m": -40, "std_m": 5}]
-)
-def test_bad_priors(client, body):
-    path = client.session()
-    problem(client.put(f"{path}/prior", json=body), 422, "invalid_prior")
-    problem(client.put(f"{path}/prior", json={"position_m": 3}), 422, "invalid_request")
-
-
-def test_bodies_of_other_types_are_no_frames(client):
-    problem(client.put(FRAME, content=b"x", headers={"Content-Type": "text/plain"}), 415, "unsupported_media_type")
-    problem(client.put(FRAME, content=encoded(picture(1)), headers=JPEG), 415, "unsupported_media_type")
-    path = FRAME.replace("ready", "seen")
-    problem(client.put(path, content=b"x", headers=JPEG), 422, "undecodable_image")
-    problem(client.post(FRAMES, content=b"", headers=NPZ), 422, "empty_body")
 
 
 # Names and states
@@ -299,39 +257,79 @@ def test_whatever_is_asked_of_a_domain_session_or_job_that_nobody_knows(client):
     assert n_asked > 25
 
 
-NOWHERE = [
-    ("GET", "/v1/admin/jobs?domain=nowhere", None, 404, "unknown_domain"),
-    ("GET", "/v1/admin/sessions?domain=nowhere", None, 404, "unknown_domain"),
-    ("GET", f"{ADMIN}/traverses/none", None, 404, "unknown_traverse"),
-    ("DELETE", f"{ADMIN}/traverses/none", None, 404, "unknown_traverse"),
-    ("PUT", f"{ADMIN}/traverses/none/frames/0?position_m=1", {"encoding": [1]}, 404, "unknown_traverse"),
-    ("POST", f"{ADMIN}/remaps", {"training_traverse": "none"}, 404, "unknown_traverse"),
-    ("POST", f"{ADMIN}/remaps", {**REMAP, "check_traverse": "none"}, 404, "unknown_traverse"),
-    ("GET", f"{ADMIN}/maps/9/file", None, 404, "unknown_map_version"),
-    ("GET", f"{ADMIN}/maps/0/file", None, 422, "invalid_request"),
-    ("DELETE", f"{ADMIN}/maps/9", None, 404, "unknown_map_version"),
-    ("DELETE", f"{ADMIN}/maps/x", None, 422, "invalid_request"),
-    ("GET", f"{READY}/landmark-model?map_version=99", None, 404, "unknown_map_version"),
-    ("GET", f"{READY}/landmark-model?map_version=0", None, 422, "invalid_request"),
-    ("PUT", f"{ADMIN}/active-map", {"version": 99, "expected": 1}, 404, "unknown_map_version"),
-    ("PUT", f"{ADMIN}/active-map", {"version": 1, "expected": 99}, 409, "lost_activation"),
-    ("PUT", f"{ADMIN}/active-map", {"version": 1, "expected": None}, 409, "lost_activation"),
-    ("PUT", ADMIN, {"evaluator": KIND, "closed": True}, 409, "domain_differs"),
-    ("POST", "/v1/domains/unmapped/localizations", RANKS, 409, "no_active_map"),
-    ("POST", "/v1/domains/unmapped/sessions", {}, 409, "no_active_map"),
-    ("GET", "/v1/domains/unmapped/landmark-model", None, 409, "no_active_map"),
-    ("GET", "/v2/domains", None, 404, "not_found"),
-    ("GET", "/v1/domains/", None, 404, "not_found"),
-    ("GET", "/v1/domains/..%2f..%2fcatalog.sqlite", None, 404, "not_found"),
-    ("GET", "/v1/domains/%F0%9F%A4%96/%ff?%ff=%00", None, 404, "not_found"),
-    ("BREW", "/healthz", None, 405, "method_not_allowed"),
-]
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code", "bodies"),
+    [
+        ("POST", SESSIONS, 422, "invalid_prior", ('{"start_position_m": NaN}', '{"start_position_m": 1e999}')),
+        ("POST", SESSIONS, 422, "invalid_prior", ({"start_position_m": 500}, {"start_std_m": 0})),
+        ("POST", SESSIONS, 422, "invalid_input", ({"planner": "clever"}, {"planner": "constant:3.5"})),
+        ("POST", SESSIONS, 422, "empty_body", (b"",)),
+        ("PUT", BAD, 422, "invalid_request", ({}, '{"evaluator": {"\\ud800": 1}}', NESTED_KIND)),
+        ("PUT", BAD, 422, "invalid_request", ({"evaluator": KIND, "actions_m": list(range(1, 100))},)),
+        ("PUT", BAD, 422, "invalid_input", ({"evaluator": {}}, {"evaluator": {"kind": "telepathy"}})),
+        ("PUT", BAD, 422, "invalid_input", ({"evaluator": {**KIND, "extractor": "magic"}},)),
+        ("PUT", BAD, 422, "invalid_input", ({"evaluator": {**KIND, "a": 1}},)),
+        ("PUT", FRAME, 422, "invalid_encoding", ({"encoding": [1.0]}, '{"encoding": [NaN]}')),
+        ("PUT", FRAME, 422, "invalid_request", ({"ranked_landmarks": [1]},)),
+        ("PUT", FRAME, 422, "empty_body", (b"",)),
+        ("PUT", FRAME.replace("ready", "seen"), 422, "invalid_encoding", ({"encoding": [1.0, 2.0]},)),
+        ("POST", REMAPS, 422, "invalid_map_config", ({**REMAP, "n_landmarks": 10, "list_length": 11},)),
+        ("POST", REMAPS, 422, "invalid_map_config", ({**REMAP, "check_traverse": "drive"},)),
+        ("POST", REMAPS, 422, "invalid_map_config", ({**REMAP, "append": True, "landmark_traverse": "drive"},)),
+        ("POST", REMAPS, 404, "unknown_traverse", ({"training_traverse": "none"}, {**REMAP, "check_traverse": "none"})),
+        ("GET", "/v1/admin/jobs?domain=nowhere", 404, "unknown_domain", NO_BODY),
+        ("GET", "/v1/admin/sessions?domain=nowhere", 404, "unknown_domain", NO_BODY),
+        ("GET", "/v1/sessions/none/events?after=-1", 422, "invalid_request", NO_BODY),
+        ("GET", f"{ADMIN}/traverses/none", 404, "unknown_traverse", NO_BODY),
+        ("DELETE", f"{ADMIN}/traverses/none", 404, "unknown_traverse", NO_BODY),
+        ("PUT", f"{ADMIN}/traverses/none/frames/0?position_m=1", 404, "unknown_traverse", ({"encoding": [1]},)),
+        ("GET", f"{ADMIN}/maps/9/file", 404, "unknown_map_version", NO_BODY),
+        ("GET", f"{ADMIN}/maps/0/file", 422, "invalid_request", NO_BODY),
+        ("DELETE", f"{ADMIN}/maps/9", 404, "unknown_map_version", NO_BODY),
+        ("DELETE", f"{ADMIN}/maps/x", 422, "invalid_request", NO_BODY),
+        ("GET", f"{READY}/landmark-model?map_version=99", 404, "unknown_map_version", NO_BODY),
+        ("GET", f"{READY}/landmark-model?map_version=0", 422, "invalid_request", NO_BODY),
+        ("GET", f"{READY}/coverage?map_version=99", 404, "unknown_map_version", NO_BODY),
+        ("GET", f"{SEEN}/landmarks/0/thumbnail", 404, "unknown_thumbnail", NO_BODY),
+        ("GET", f"{SEEN}/landmarks/{N_SEEN}/thumbnail", 404, "unknown_thumbnail", NO_BODY),
+        ("PUT", f"{ADMIN}/active-map", 404, "unknown_map_version", ({"version": 99, "expected": 1},)),
+        ("PUT", f"{ADMIN}/active-map", 409, "lost_activation", [{"version": 1, "expected": n} for n in (99, None)]),
+        ("PUT", ADMIN, 409, "domain_differs", ({"evaluator": KIND, "closed": True},)),
+        ("POST", f"{UNMAPPED}/localizations", 409, "no_active_map", (RANKS,)),
+        ("POST", f"{UNMAPPED}/sessions", 409, "no_active_map", ({},)),
+        *(("GET", f"{UNMAPPED}/{name}", 409, "no_active_map", NO_BODY) for name in OF_A_MAP),
+        ("GET", "/v2/domains", 404, "not_found", NO_BODY),
+        ("GET", "/v1/domains/", 404, "not_found", NO_BODY),
+        ("GET", "/v1/domains/..%2f..%2fcatalog.sqlite", 404, "not_found", NO_BODY),
+        ("GET", "/v1/domains/%F0%9F%A4%96/%ff?%ff=%00", 404, "not_found", NO_BODY),
+        ("BREW", "/healthz", 405, "method_not_allowed", NO_BODY),
+    ],
+)
+def test_what_cannot_be_or_is_not_there(client, method, path, status, code, bodies):
+    for body in bodies:
+        document = problem(ask(client, method, path, body), status, code)
+        assert code != "no_active_map" or "remap" in document["detail"]
+    assert client.get("/v1/domains/bad").status_code == 404
 
 
-@pytest.mark.parametrize(("method", "path", "body", "status", "code"), NOWHERE)
-def test_what_is_not_there(client, method, path, body, status, code):
-    document = problem(ask(client, method, path, body), status, code)
-    assert code != "no_active_map" or "remap" in document["detail"]
+def test_a_prior_that_cannot_be(client):
+    path = f"{client.session()}/prior"
+    for position_m, std_m in ((1e6, 1), (1, 0), (-40, 5)):
+        problem(client.put(path, json={"position_m": position_m, "std_m": std_m}), 422, "invalid_prior")
+    problem(client.put(path, json={"position_m": 3}), 422, "invalid_request")
+
+
+@pytest.mark.parametrize(
+    ("of", "body", "content_type", "status", "code"),
+    [
+        ("ready", b"x", "text/plain", 415, "unsupported_media_type"),
+        ("ready", encoded(picture(1)), "image/jpeg", 415, "unsupported_media_type"),
+        ("seen", b"x", "image/jpeg", 422, "undecodable_image"),
+    ],
+)
+def test_what_is_no_frame(client, of, body, content_type, status, code):
+    path = FRAME.replace("ready", of)
+    problem(client.put(path, content=body, headers={"Content-Type": content_type}), status, code)
 
 
 def test_a_method_that_a_path_does_not_know(client):
@@ -340,31 +338,25 @@ def test_a_method_that_a_path_does_not_know(client):
     assert answer.headers["allow"] == "GET"
 
 
-@pytest.mark.parametrize(
-    "name", ["%2e%2e", ".hidden", "a b", "a'--", "é", "x" * 65, "%00", "%F0%9F%A4%96", "-a", "a%0a"]
-)
-def test_names_that_are_none(client, name):
-    problem(client.get(f"/v1/domains/{name}"), 422, "invalid_request")
-    problem(client.put(f"/v1/admin/domains/{name}", json={"evaluator": KIND}), 422, "invalid_request")
+def test_names_that_are_none(client):
+    for name in ("%2e%2e", ".hidden", "a b", "a'--", "é", "x" * 65, "%00", "%F0%9F%A4%96", "-a", "a%0a"):
+        problem(client.get(f"/v1/domains/{name}"), 422, "invalid_request")
+        problem(client.put(f"/v1/admin/domains/{name}", json={"evaluator": KIND}), 422, "invalid_request")
 
 
 # What only a job finds out
 
 
 def test_an_unknown_word_is_answered_with_the_nearest_and_with_what_there_is(client):
-    def detail(answer, status, code):
-        return problem(answer, status, code)["detail"]
-
-    sentence = detail(client.get("/v1/domains/raedy"), 404, "unknown_domain")
-    assert "did you mean ready? There is " in sentence
-    assert "did you mean drive?" in detail(client.get(f"{ADMIN}/traverses/drvie"), 404, "unknown_traverse")
-    sessions = f"{READY}/sessions"
-    assert "did you mean informed?" in detail(client.post(sessions, json={"planner": "infromed"}), 422, "invalid_input")
-    for body, nearest in (({"planer": "nnql"}, "planner"), ({"update": "mixtrue"}, "mixture")):
-        assert f"did you mean {nearest}? There is " in detail(client.post(sessions, json=body), 422, "invalid_request")
-    kinds = {"evaluator": {"kind": "featurel2"}}
-    put_answer = client.put("/v1/admin/domains/mistyped", json=kinds)
-    assert "did you mean feature_l2?" in detail(put_answer, 422, "invalid_input")
+    for method, path, body, status, code, nearest in (
+        ("GET", "/v1/domains/raedy", None, 404, "unknown_domain", "ready? There is "),
+        ("GET", f"{ADMIN}/traverses/drvie", None, 404, "unknown_traverse", "drive?"),
+        ("POST", SESSIONS, {"planner": "infromed"}, 422, "invalid_input", "informed?"),
+        ("POST", SESSIONS, {"planer": "nnql"}, 422, "invalid_request", "planner? There is "),
+        ("POST", SESSIONS, {"update": "mixtrue"}, 422, "invalid_request", "mixture? There is "),
+        ("PUT", BAD, {"evaluator": {"kind": "featurel2"}}, 422, "invalid_input", "feature_l2?"),
+    ):
+        assert f"did you mean {nearest}" in problem(ask(client, method, path, body), status, code)["detail"]
 
 
 def test_a_query_parameter_that_a_call_does_not_take_is_refused_by_every_one(client):
@@ -389,13 +381,9 @@ def test_a_query_parameter_that_a_call_does_not_take_is_refused_by_every_one(cli
 def test_remaps_that_fail_leave_the_map_that_serves(client):
     client.upload("ready", "backwards", ready_encodings()[:2], [5.0, 4.0])
     client.post(f"{ADMIN}/traverses", json={"name": "empty"})
-    for config, code in (
-        ({"training_traverse": "backwards"}, "invalid_route"),
-        ({"training_traverse": "backwards", "landmark_traverse": "drive", "relevance": "rrf"}, "invalid_route"),
-    ):
-        job = client.remap("ready", **config)
-        assert job["state"] == "failed"
-        assert job["error"]["code"] == code
+    for config in ({}, {"landmark_traverse": "drive", "relevance": "rrf"}):
+        job = client.remap("ready", training_traverse="backwards", **config)
+        assert (job["state"], job["error"]["code"]) == ("failed", "invalid_route")
     n_jobs = len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"])
     for options, complaint in (  # what can be known before a job is made
         ({"training_traverse": "empty"}, "no frames yet"),
@@ -408,11 +396,11 @@ def test_remaps_that_fail_leave_the_map_that_serves(client):
         ({"training_traverse": "backwards", "relevance": "rrf"}, "the number of landmarks, 2"),
         ({"training_traverse": "backwards", "append": True, "list_length": 3}, "what is appended to it must be alike"),
     ):
-        document = problem(client.post(f"{ADMIN}/remaps", json={**REMAP, **options}), 422, "invalid_map_config")
+        document = problem(client.post(REMAPS, json={**REMAP, **options}), 422, "invalid_map_config")
         assert complaint in document["detail"]
     assert len(client.get("/v1/admin/jobs?domain=ready").json()["jobs"]) == n_jobs
     too_many = {**REMAP, "landmark_traverse": "drive", "n_landmarks": N_READY + 1}
-    assert problem(client.post(f"{ADMIN}/remaps", json=too_many), 422, "too_few_candidates")["n_candidates"] == N_READY
+    assert problem(client.post(REMAPS, json=too_many), 422, "too_few_candidates")["n_candidates"] == N_READY
     assert client.get(READY).json()["map_version"] == 1
     client.post("/v1/admin/domains/unmapped/traverses", json={"name": "drive"})
     answer = client.post("/v1/admin/domains/unmapped/remaps", json={**REMAP, "append": True})
@@ -420,8 +408,8 @@ def test_remaps_that_fail_leave_the_map_that_serves(client):
 
 
 def test_a_damaged_map(client, domain, data_dir):
-    place, active = f"/v1/domains/{domain}/localizations", f"/v1/admin/domains/{domain}/active-map"
-    assert client.post(place, json=RANKS).status_code == 200
+    place, active = f"/v1/domains/{domain}", f"/v1/admin/domains/{domain}/active-map"
+    client.localize(domain)
     client.remap(domain, activate=False)
     path = data_dir / "domains" / domain / "maps" / "000002.sqlite"
     content = bytearray(path.read_bytes())
@@ -430,26 +418,22 @@ def test_a_damaged_map(client, domain, data_dir):
     path.write_bytes(content)
     # A damaged version never takes over ...
     problem(client.put(active, json={"version": 2, "expected": 1}), 503, "damaged_map")
-    assert client.get(f"/v1/domains/{domain}").json()["map_version"] == 1
+    assert client.get(place).json()["map_version"] == 1
     # ... and one damaged while it was active is named, not half answered.
     path.write_bytes(content[: len(content) // 3])
     with Catalog.open(data_dir) as catalog:
         catalog.activate(domain, 2, ANY)
     client.services.maps.forget(domain)
     for _ in range(2):
-        answer = client.post(place, json=RANKS)
+        answer = client.post(f"{place}/localizations", json=RANKS)
         assert problem(answer, 503, "damaged_map")["map_version"] == 2
         assert int(answer.headers["retry-after"]) > 0
         assert str(data_dir) not in answer.text
-        problem(client.get(f"/v1/domains/{domain}/landmark-model"), 503, "damaged_map")
-    description = client.get(f"/v1/domains/{domain}").json()
-    assert (description["map_version"], description["map_problem"], description["n_map_images"]) == (
-        2,
-        "damaged_map",
-        None,
-    )
+        problem(client.get(f"{place}/landmark-model"), 503, "damaged_map")
+    expected = {"map_version": 2, "map_problem": "damaged_map", "n_map_images": None}
+    assert client.get(place).json().items() >= expected.items()
     assert client.put(active, json={"version": 1, "expected": 2}).status_code == 200
-    assert client.post(place, json=RANKS).status_code == 200
+    client.localize(domain)
 
 
 def test_our_own_fault_tells_nothing_but_its_id(client, monkeypatch):
@@ -477,9 +461,9 @@ def season(seed, n_frames=PLACES):
 
 @pytest.fixture
 def map_drives(client, request):
-    """A function that maps drives; it returns the job, and a function that localizes a view."""
+    """A function that maps drives; it returns the job, and a function that tells where a view is."""
     name = f"drives-{zlib.crc32(request.node.name.encode())}"
-    assert client.put(f"/v1/admin/domains/{name}", json={"evaluator": {**KIND, "extractor": "none"}}).is_success
+    client.make_domain(name)
 
     def map_drives(summer, winter=None, plane=(None, None), **remap):
         for traverse, encodings, at_m in (("summer", summer, plane[0]), ("winter", winter, plane[1])):
@@ -488,9 +472,7 @@ def map_drives(client, request):
                 client.upload(name, traverse, encodings, np.arange(float(len(encodings))), **x_m)
         options = {"training_episodes": 0, **({} if winter is None else {"landmark_traverse": "winter"}), **remap}
         job = client.remap(name, training_traverse="summer", **options)
-        return job, lambda view: client.post(
-            f"/v1/domains/{name}/localizations", json={"encoding": view.astype(float).tolist()}
-        ).json()
+        return job, lambda view: client.localize(name, {"encoding": view.astype(float).tolist()})["belief"]["mode_m"]
 
     yield map_drives
     assert client.delete(f"/v1/admin/domains/{name}").status_code == 204
@@ -509,23 +491,21 @@ def test_a_number_that_stands_still_in_a_season_says_nothing(map_drives, still):
     assert sum(expected in warning for warning in job["result"]["metrics"]["warnings"]) == (still != "both")
     for value in (-3, 0, 700):
         live[:, 3] = value
-        assert [place(live[frame])["belief"]["mode_m"] for frame in (30, 80)] == [30, 80]
+        assert [place(live[frame]) for frame in (30, 80)] == [30, 80]
 
 
-@pytest.mark.parametrize("n_frames", [3, 1])
-def test_fewer_frames_than_a_list_takes_are_refused_at_once(client, n_frames):
-    base = f"/v1/admin/domains/few-{n_frames}"
-    assert client.put(base, json={"evaluator": {**KIND, "extractor": "none"}}).is_success
-    client.upload(f"few-{n_frames}", "drive", season(1, n_frames), np.arange(float(n_frames)))
-    document = problem(client.post(f"{base}/remaps", json=REMAP), 422, "invalid_map_config")
-    assert "list_length 4" in document["detail"]
-    assert client.delete(base).status_code == 204
+def test_fewer_frames_than_a_list_takes_are_refused_at_once(client):
+    client.make_domain("few")
+    for n_frames in (3, 1):
+        client.upload("few", f"drive-{n_frames}", season(1, n_frames), np.arange(float(n_frames)))
+        answer = client.post("/v1/admin/domains/few/remaps", json={"training_traverse": f"drive-{n_frames}"})
+        assert "list_length 4" in problem(answer, 422, "invalid_map_config")["detail"]
 
 
 def test_a_short_drive_is_mapped_by_landmarks_of_a_longer_one(map_drives):
     job, place = map_drives(season(1)[:3], season(2), n_landmarks=100)
     assert job["state"] == "succeeded", job["error"]
-    assert place(season(3)[1])["belief"]["mode_m"] == 1
+    assert place(season(3)[1]) == 1
 
 
 @pytest.mark.parametrize("plane", [False, True])
@@ -536,7 +516,7 @@ def test_a_drive_the_other_way_teaches_no_second_season(map_drives, plane):
     says = "share 0 places" if plane else "agree no better than where one is shifted"
     assert (verdict["accepted"], says in verdict["why"]) == (False, True)
     assert job["result"]["metrics"]["warnings"] == [f"it learnt nothing of a second season: {verdict['why']}"]
-    assert place(season(3)[30])["belief"]["mode_m"] == 30
+    assert place(season(3)[30]) == 30
 
 
 def test_a_drive_of_another_extractor_is_named_or_teaches_nothing(map_drives, client):
@@ -564,4 +544,4 @@ def test_a_drive_that_shows_one_picture_alone_is_named(map_drives, covered, rele
 def test_encodings_of_any_size_are_compared(map_drives, scale):
     job, place = map_drives(season(1) * np.float32(scale))
     assert job["state"] == "succeeded", job["error"]
-    assert place(season(3)[30] * np.float32(scale))["belief"]["mode_m"] == 30
+    assert place(season(3)[30] * np.float32(scale)) == 30

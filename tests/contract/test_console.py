@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepsimbad.store.catalog import Catalog
-from deepsimbad.store.records import KeyScope
-
-from .conftest import JPEG, RANKS, TAKES_ENCODINGS, encoded, path_of, picture, problem, service
+from .conftest import RANKS, TAKES_ENCODINGS, image_body, path_of, picture, problem
 
 FILES = Path(str(resources.files("deepsimbad") / "console"))
 
@@ -69,15 +66,12 @@ def events(client, path, **options):
 def test_a_sessions_events_are_what_its_observations_were_answered(client):
     session = client.begin()
     path = path_of(session)
-    answers = [client.post(f"{path}/observations?action_m=2", json=RANKS).json() for _ in range(3)]
+    answers = [client.observe(path, action_m=2) for _ in range(3)]
     prior = client.put(f"{path}/prior", json={"position_m": 10.0, "std_m": 2.0}).json()
     assert client.delete(path).status_code == 204
     rows = events(client, path, params={"after": 0})
-    assert [(name, number) for name, number, _ in rows] == [
-        *(("observation", str(n)) for n in (1, 2, 3)),
-        ("prior", "4"),
-        ("done", None),
-    ]
+    names = [(name, number) for name, number, _ in rows]
+    assert names == [*(("observation", number) for number in "123"), ("prior", "4"), ("done", None)]
     for answer, (_, _, event) in zip([*answers, prior], rows, strict=False):
         for document in (answer, event):
             document.pop("timings_ms", None)
@@ -90,8 +84,7 @@ def test_a_sessions_events_are_what_its_observations_were_answered(client):
 
 def test_what_a_robot_saw_is_not_held_for_a_domain_that_keeps_no_pictures(client):
     path = client.session("seen")
-    answer = client.post(f"{path}/observations", content=encoded(picture(3)), headers=JPEG)
-    assert answer.status_code == 200
+    client.observe(path, image_body(picture(3)))
     assert client.get(f"{path}/view").status_code == 204
 
 
@@ -103,26 +96,6 @@ def test_events_come_while_a_session_lives(client):
         assert next(line for line in lines if line.startswith("event: ")) == "event: observation"
         client.delete(path)
         assert next(line for line in lines if line.startswith("event: ")) == "event: done"
-
-
-def test_events_of_sessions_that_are_none_or_not_ones_own(tmp_path):
-    with Catalog.open(tmp_path) as catalog:
-        admin, robot, other = (
-            catalog.create_key(scope)[1].text for scope in (KeyScope.ADMIN, *2 * [KeyScope.LOCALIZE])
-        )
-    with service(tmp_path) as client:
-        client.headers["X-API-Key"] = admin
-        client.make_ready_domain("ready")
-        client.headers["X-API-Key"] = robot
-        path = client.session()
-        client.delete(path)
-        assert [name for name, _, _ in events(client, path)] == ["done"]
-        client.headers["X-API-Key"] = other
-        problem(client.get(f"{path}/events"), 404, "unknown_session")
-        client.headers["X-API-Key"] = admin
-        assert [name for name, _, _ in events(client, path)] == ["done"]
-        problem(client.get("/v1/sessions/none/events"), 404, "unknown_session")
-        problem(client.get(f"{path}/events?after=-1"), 422, "invalid_request")
 
 
 def test_coverage_names_every_map_image_and_the_worst_stretches(client):
@@ -141,8 +114,6 @@ def test_coverage_names_every_map_image_and_the_worst_stretches(client):
         chances = chance[stretch["first_map_image"] : stretch["last_map_image"] + 1]
         assert stretch["chance"] == pytest.approx(chances.mean(), abs=1e-3)
         assert chances.mean() < chance.mean()
-    problem(client.get("/v1/domains/unmapped/coverage"), 409, "no_active_map")
-    problem(client.get("/v1/domains/ready/coverage?map_version=99"), 404, "unknown_map_version")
 
 
 def test_landmarks_are_known_by_the_frames_they_began_as(client):
@@ -153,9 +124,6 @@ def test_landmarks_are_known_by_the_frames_they_began_as(client):
     assert sum(answer["n_map_images"]) == description["n_map_images"] * description["list_length"]
     assert sorted(answer["map_image"]) == list(range(description["n_map_images"])), "of its own drive, all of them"
     assert set(answer["drive"]) == {"drive"}
-    problem(client.get("/v1/domains/seen/landmarks/0/thumbnail"), 404, "unknown_thumbnail")
-    problem(client.get(f"/v1/domains/seen/landmarks/{description['n_landmarks']}/thumbnail"), 404, "unknown_thumbnail")
-    problem(client.get("/v1/domains/unmapped/landmarks"), 409, "no_active_map")
 
 
 def test_what_a_domain_shows_may_be_changed_and_nothing_else(client, domain):

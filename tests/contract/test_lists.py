@@ -2,7 +2,7 @@
 
 import pytest
 
-from .conftest import RANKS, TAKES_ENCODINGS, path_of, problem
+from .conftest import path_of, problem
 
 LISTS = [
     ("/v1/admin/domains/full/traverses", "traverses", "name", ["Z", "a", "b-1", "b.2", "drive"]),
@@ -15,11 +15,8 @@ OF_FULL = pytest.mark.usefixtures("_full")
 
 def page(client, path, **params):
     path, _, domain = path.partition("?domain=")
-    answer = client.get(path, params={**params, **({"domain": domain} if domain else {})})
-    assert answer.status_code == 200, answer.text
-    document = answer.json()
-    assert len(document) == 2
-    assert "next" in document
+    document = client.answer_to("GET", path, params={**params, **({"domain": domain} if domain else {})})
+    assert (len(document), "next" in document) == (2, True)
     return document
 
 
@@ -43,7 +40,7 @@ def _full(client):
     for name in ("b.2", "a", "Z", "b-1"):
         client.post("/v1/admin/domains/full/traverses", json={"name": name})
     for _ in range(2):
-        assert client.remap("full", training_episodes=0)["state"] == "succeeded"
+        client.make_map("full", training_episodes=0)
     for _ in range(4):
         client.begin("full")
 
@@ -79,7 +76,7 @@ def test_what_is_made_or_goes_meanwhile_moves_nothing(client):
     assert len(set(session_ids)) == len(session_ids) == 4
     assert client.delete(path_of(new_session)).status_code == 204
 
-    client.put("/v1/admin/domains/shrinking", json=TAKES_ENCODINGS)
+    client.make_domain("shrinking")
     base = "/v1/admin/domains/shrinking/traverses"
     for name in "abcd":
         client.post(base, json={"name": name})
@@ -91,15 +88,16 @@ def test_what_is_made_or_goes_meanwhile_moves_nothing(client):
 def test_a_listed_session_is_the_session(client, domain):
     old_path, new_path = client.session(domain), client.session(domain)
     for _ in range(2):
-        client.post(f"{old_path}/observations", json=RANKS)
+        client.observe(old_path)
     client.put(f"{old_path}/prior", json={"position_m": 10, "std_m": 2})
     state = client.get(old_path).json()
     sessions = page(client, f"/v1/admin/sessions?domain={domain}")["sessions"]
     assert [path_of(session) for session in sessions] == [new_path, old_path]
     assert sessions[1]["created_at"] < sessions[1]["expires_at"] == state["expires_at"]
-    for member in ("domain", "map_version", "n_observations"):
-        assert sessions[1][member] == state[member]
-    assert (sessions[0]["n_observations"], sessions[1]["n_observations"]) == (0, 2)
+    assert [session["n_observations"] for session in sessions] == [0, 2]
+    assert (
+        state.items() >= {member: sessions[1][member] for member in ("domain", "map_version", "n_observations")}.items()
+    )
     assert sessions[1] in entries(client, "/v1/admin/sessions", "sessions", 7)
     client.delete(old_path)
     sessions = page(client, f"/v1/admin/sessions?domain={domain}")["sessions"]
@@ -129,6 +127,5 @@ def test_domains_come_in_pages_by_name(client):
     assert {"full", "ready"} <= set(names)
     for limit in (1, 2, 1000):
         assert entries(client, "/v1/domains", "domains", limit) == document["domains"]
-    assert [domain["name"] for domain in page(client, "/v1/domains", limit=1, after="domains-full0")["domains"]] == [
-        next(name for name in names if name > "full0")
-    ]
+    (behind,) = page(client, "/v1/domains", limit=1, after="domains-full0")["domains"]
+    assert behind["name"] == next(name for name in names if name > "full0")

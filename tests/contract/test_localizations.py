@@ -10,13 +10,13 @@ import pytest
 
 from .conftest import (
     DIM,
+    JSON,
     N_LANDMARKS,
     N_READY,
     N_SEEN,
     RANKS,
     TAKES_ENCODINGS,
-    encoded,
-    path_of,
+    image_body,
     picture,
     ready_encodings,
 )
@@ -24,11 +24,8 @@ from .conftest import (
 READY = "/v1/domains/ready/localizations"
 
 
-def localize(client, body=RANKS, shortlist=10, of="ready"):
-    answer = client.post(f"/v1/domains/{of}/localizations", params={"shortlist": shortlist}, json=body)
-    assert answer.status_code == 200, answer.text
-    assert answer.headers["content-type"] == "application/json"
-    document = answer.json()
+def localize(client, view=RANKS, shortlist=10, of="ready"):
+    document = client.localize(of, view, shortlist=shortlist)
     assert len(document["retrieval"]) == len(document["belief"]["top"]) == shortlist
     return document
 
@@ -38,8 +35,7 @@ def test_the_answer_has_every_member_of_the_contract(client):
     assert set(answer) == {
         *("map_version", "timings_ms", "belief", "retrieval", "next_best_view", "informative", "warnings")
     }
-    assert answer["map_version"] == 1
-    assert (answer["informative"], answer["warnings"]) == (True, [])
+    assert (answer["map_version"], answer["informative"], answer["warnings"]) == (1, True, [])
     plan = answer["next_best_view"]
     assert set(plan) == {"planner", "action_m", "stop", "actions"}
     assert (plan["planner"], plan["stop"]) == ("informed", answer["belief"]["confident"])
@@ -89,39 +85,32 @@ def test_a_map_frames_own_encoding_is_found_again_and_unknown_coordinates_are_nu
     ],
 )
 def test_a_picture_that_lies_on_its_side_or_is_of_another_shape_is_answered_with_a_warning(client, turn, size, says):
-    view = picture(7) if turn is None else cv2.rotate(picture(7), turn)
-    view_request = {"content": encoded(cv2.resize(view, size), ".tiff"), "headers": {"Content-Type": "image/tiff"}}
-    session = client.begin("seen")
-    answers = [client.post("/v1/domains/seen/localizations", **view_request).json()]
-    view_request["headers"]["Idempotency-Key"] = "once"
-    answers += [client.post(f"{path_of(session)}/observations", **view_request).json() for _ in range(2)]
+    image = picture(7) if turn is None else cv2.rotate(picture(7), turn)
+    view, path = image_body(cv2.resize(image, size), "tiff"), client.session("seen")
+    answers = [client.localize("seen", view)]
+    view["headers"]["Idempotency-Key"] = "once"
+    answers += [client.observe(path, view) for _ in range(2)]
     for answer in answers:
         assert [says in warning for warning in answer["warnings"] if "pixels" in warning] == [True] * (says is not None)
 
 
-@pytest.mark.parametrize("kind", ["jpg", "pjpeg", "tif", "x-png", "X-TIFF"])
-def test_types_that_are_spelt_otherwise_are_taken_and_the_bytes_say_what_it_is(client, kind):
-    view_request = {"content": encoded(picture(7)), "headers": {"Content-Type": f"image/{kind}"}}
-    answer = client.post("/v1/domains/seen/localizations", **view_request)
-    assert answer.json()["retrieval"][0]["map_image"] == 7
+IMAGE_TYPES = [(kind, kind) for kind in ("jpeg", "png", "tiff", "webp")]
+IMAGE_TYPES += [("jpeg", spelling) for spelling in ("jpg", "pjpeg", "tif", "x-png", "X-TIFF")]
+
+
+@pytest.mark.parametrize(("kind", "spelling"), IMAGE_TYPES)
+def test_images_of_all_types_are_found_again_and_the_bytes_say_what_it_is(client, kind, spelling):
+    view = {**image_body(picture(7), kind), "headers": {"Content-Type": f"image/{spelling}"}}
+    answer = client.localize("seen", view)
+    assert answer["retrieval"][0]["map_image"] == 7
+    assert answer["belief"]["top"][0]["frame"] == "Straße 7.png"
 
 
 def test_a_byte_order_mark_before_json_is_passed_over(client):
-    path, body = "/v1/domains/ready/localizations", b'{"ranked_landmarks": [7, 3, 1]}'
-    plain, marked = (
-        client.post(path, content=mark + body, headers={"Content-Type": "application/json"}).json()
-        for mark in (b"", b"\xef\xbb\xbf")
-    )
+    body = b'{"ranked_landmarks": [7, 3, 1]}'
+    bodies = ({"content": mark + body, "headers": JSON} for mark in (b"", b"\xef\xbb\xbf"))
+    plain, marked = (client.localize(view=view) for view in bodies)
     assert marked["belief"] == plain["belief"]
-
-
-@pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
-def test_images_of_all_types_are_found_again(client, kind):
-    view_request = {"content": encoded(picture(7), f".{kind}"), "headers": {"Content-Type": f"image/{kind}"}}
-    answer = client.post("/v1/domains/seen/localizations", **view_request)
-    assert answer.status_code == 200, answer.text
-    assert answer.json()["retrieval"][0]["map_image"] == 7
-    assert answer.json()["belief"]["top"][0]["frame"] == "Straße 7.png"
 
 
 def test_dissimilarities_by_the_served_landmark_model_are_answered_as_the_encoding_is(client):
@@ -152,8 +141,7 @@ def test_a_view_that_shows_nothing_is_said_so(client):
 
 def test_encoding_dissimilarities_and_ranks_of_one_view_get_one_answer_where_ranks_are_compared(client, domain):
     """The landmarks by the paper's rule, slowly: the frames farthest from their nearest other."""
-    job = client.remap(domain, landmark_traverse="drive", n_landmarks=N_LANDMARKS, relevance="rrf")
-    assert job["state"] == "succeeded", job
+    client.make_map(domain, landmark_traverse="drive", n_landmarks=N_LANDMARKS, relevance="rrf")
     encodings = ready_encodings().astype(np.float64)
     squared_distances = np.square(encodings[:, None] - encodings[None]).sum(axis=2)
     np.fill_diagonal(squared_distances, np.inf)
@@ -192,14 +180,13 @@ def test_all_relevances_as_npy(client):
 
 
 def test_a_map_smaller_than_the_default_shortlist_gives_all_it_has(client):
-    client.put("/v1/admin/domains/lonely", json=TAKES_ENCODINGS)
+    client.make_domain("lonely")
     client.upload("lonely", "two", [[0.0] * DIM, [1.0] * DIM], [5.0, 5.0])
     client.upload("lonely", "single", [[1.0] * DIM], [5.0])
     client.remap("lonely", training_traverse="single", landmark_traverse="two", n_landmarks=2, list_length=2)
-    answer = client.post("/v1/domains/lonely/localizations", json={"ranked_landmarks": [0]})
-    assert answer.status_code == 200, answer.text
-    belief = answer.json()["belief"]
-    assert [place["map_image"] for place in answer.json()["retrieval"]] == [0]
+    answer = client.localize("lonely", {"ranked_landmarks": [0]})
+    belief = answer["belief"]
+    assert [place["map_image"] for place in answer["retrieval"]] == [0]
     assert belief["histogram"] == {"edges_m": [5.0, 5.0], "mass": [1.0]}
     assert (belief["entropy_bits"], belief["credible_95_m"]) == (0, [5.0, 5.0])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import JPEG, N_READY, RANKS, encoded, picture, ready_encodings, service
+from .conftest import N_READY, RANKS, image_body, picture, ready_encodings, service
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
 COMMON = {"receive", "wait", "decode", "encode", "describe", "retrieve", "plan", "total"}
@@ -114,14 +114,6 @@ def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path):
         assert damage_of() == (1, 0, [])
 
 
-def test_a_deleted_domain_takes_its_series_along(client, domain):
-    client.post(f"/v1/domains/{domain}/localizations", json=RANKS)
-    assert any(f'domain="{domain}"' in name for name in scrape(client))
-    assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
-    client.services.metrics.record_localization(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
-    assert not [name for name in scrape(client) if f'domain="{domain}"' in name]
-
-
 # Stages
 
 
@@ -130,7 +122,7 @@ def test_every_stage_is_told_and_counted(client, call):
     path = "/v1/domains/seen" if call == "localizations" else client.session("seen")
     names = {stage: f'deepsimbad_localization_stage_seconds_count{{stage="{stage}"}}' for stage in STAGES[call]}
     old_values = scrape(client)
-    timings_ms = client.post(f"{path}/{call}", content=encoded(picture(1)), headers=JPEG).json()["timings_ms"]
+    timings_ms = client.answer_to("POST", f"{path}/{call}", **image_body(picture(1)))["timings_ms"]
     assert set(timings_ms) == STAGES[call]
     assert min(timings_ms.values()) >= 0
     total = timings_ms.pop("total")

@@ -18,6 +18,7 @@ from .conftest import (
     N_READY,
     N_SEEN,
     TAKES_ENCODINGS,
+    TAKES_IMAGES,
     encoded,
     picture,
     problem,
@@ -94,27 +95,15 @@ def test_another_version_may_be_asked_for_and_a_session_keeps_its_own(rebuilt):
     path = rebuilt.session()
     rebuilt.put("/v1/admin/domains/ready/active-map", json={"version": 2})
     ranks = old_encoder.ranks(encoding=np.arange(8), m=5)
-    assert rebuilt.post(f"{path}/observations", content=ranks.body, headers=ranks.headers).status_code == 200
+    rebuilt.observe(path, {"content": ranks.body, "headers": ranks.headers})
     answer = rebuilt.post(READY, content=ranks.body, headers=ranks.headers)
     assert problem(answer, 409, "landmark_model_differs")["map_version"] == 2
 
 
 def test_ranks_by_hand(client):
     assert pack_ranked_landmarks([7, 2, 9], N_LANDMARKS) == BY_HAND
-    packed = client.post(READY, content=BY_HAND, headers=PACKED)
-    assert packed.status_code == 200, packed.text
-    as_json = client.post(READY, json={"ranked_landmarks": [7, 2, 9]})
-    assert packed.json() == {**as_json.json(), "timings_ms": packed.json()["timings_ms"]}
-
-
-@pytest.mark.parametrize(
-    "body",
-    [b"\0", b"\0\0", b"\0\x0b" + bytes(6), b"\0\2", b"\0\2\x12\0", b"\0\1\x11", b"\0\1\xa0", b"\0\2\x11"],
-    ids=["a byte", "m 0", "m over r", "too short", "too long", "padding", "id over r", "twice"],
-)
-def test_bad_ranks(post, body):
-    problem(post(content=body, headers=PACKED), 422, "invalid_ranked_landmarks")
-    problem(post(content=b"", headers=PACKED), 422, "empty_body")
+    packed = client.localize(view={"content": BY_HAND, "headers": PACKED})
+    assert client.localize(view={"ranked_landmarks": [7, 2, 9]}) | {"timings_ms": packed["timings_ms"]} == packed
 
 
 def test_a_unit_encoding_by_hand_is_answered_as_its_dissimilarities(client):
@@ -122,24 +111,38 @@ def test_a_unit_encoding_by_hand_is_answered_as_its_dissimilarities(client):
     # Three bits: 6, 3, 1, 3, 4 and three times 3, of three steps on either side of zero.
     by_hand = bytes([3, 0b110_011_00, 0b1_011_100_0, 0b11_011_011])
     assert pack_unit_encoding(u, 3) == by_hand
-    packed = client.post(READY, content=by_hand, headers=PACKED_UNIT)
-    assert packed.status_code == 200, packed.text
+    packed = client.localize(view={"content": by_hand, "headers": PACKED_UNIT})
     landmarks = np.load(io.BytesIO(client.get(MODEL).content))["prototypes"].astype(np.float64)
     dissimilarities = (2 - 2 * landmarks @ u / np.linalg.norm(u)).tolist()
-    by_dissimilarities = client.post(READY, json={"dissimilarities": dissimilarities}).json()
-    assert packed.json()["retrieval"] == [
-        {**place, "relevance": pytest.approx(place["relevance"], abs=1e-5)} for place in by_dissimilarities["retrieval"]
+    by_dissimilarities = client.localize(view={"dissimilarities": dissimilarities})["retrieval"]
+    assert packed["retrieval"] == [
+        {**place, "relevance": pytest.approx(place["relevance"], abs=1e-5)} for place in by_dissimilarities
     ]
-    by_zeros = client.post(
-        READY, content=bytes([3]) + bytes([0b011_011_01, 0b1_011_011_0, 0b11_011_011]), headers=PACKED_UNIT
-    )
-    assert by_zeros.json()["informative"] is False
+    zeros = bytes([3, 0b011_011_01, 0b1_011_011_0, 0b11_011_011])
+    assert client.localize(view={"content": zeros, "headers": PACKED_UNIT})["informative"] is False
 
 
-@pytest.mark.parametrize("body", [b"\1", b"\3\0\0", b"\3\0\0\0\0", b"\3\xff\xff\xff", b"\x09" + bytes(9)])
-def test_bad_unit_encodings_are_refused(post, body):
-    problem(post(content=body, headers=PACKED_UNIT), 422, "invalid_encoding")
-    problem(post(content=b"", headers=PACKED_UNIT), 422, "empty_body")
+BAD_RANKS = {
+    "a byte": b"\0",
+    "m 0": b"\0\0",
+    "m over r": b"\0\x0b" + bytes(6),
+    "too short": b"\0\2",
+    "too long": b"\0\2\x12\0",
+    "padding": b"\0\1\x11",
+    "id over r": b"\0\1\xa0",
+    "twice": b"\0\2\x11",
+}
+BAD_UNITS = (b"\1", b"\3\0\0", b"\3\0\0\0\0", b"\3\xff\xff\xff", b"\x09" + bytes(9))
+
+
+def test_packed_views_that_cannot_be(post):
+    for headers, code, bodies in (
+        (PACKED, "invalid_ranked_landmarks", BAD_RANKS.values()),
+        (PACKED_UNIT, "invalid_encoding", BAD_UNITS),
+    ):
+        for body in bodies:
+            problem(post(content=body, headers=headers), 422, code)
+        problem(post(content=b"", headers=headers), 422, "empty_body")
 
 
 def test_a_robot_with_other_landmarks_is_told(post, client):
@@ -167,7 +170,7 @@ def test_a_view_by_other_landmarks_moves_nothing_and_tells_no_relevances(client)
 
 def test_on_board_and_by_image_one_answer_where_ranks_are_compared(client, tmp_path):
     """The same picture is decoded, encoded and ranked on board, and by the service."""
-    client.put("/v1/admin/domains/ranked", json={"evaluator": {"kind": "feature_l2"}})
+    client.make_domain("ranked", **TAKES_IMAGES)
     client.upload_pictures("ranked", "drive")
     client.remap("ranked", landmark_traverse="drive", n_landmarks=N_SEEN, list_length=3, relevance="standardised")
     robot = Client(str(client.base_url), transport=client._transport)
@@ -192,11 +195,9 @@ def test_a_few_bytes_find_the_place_on_a_map_that_compares_encodings(client):
     encoder = robot.on_board("seen")
     for number in (5, 3):
         for packed_view in (encoder.view(encoded(picture(number))), encoder.ranks(encoded(picture(number)))):
-            assert robot.localize("seen", on_board=packed_view).retrieval[0].map_image == number
-            assert (
-                robot.localize_anywhere(on_board=packed_view, domains=["seen"]).domains[0].retrieval[0].map_image
-                == number
-            )
+            (answer,) = robot.localize_anywhere(on_board=packed_view, domains=["seen"]).domains
+            for retrieval in (robot.localize("seen", on_board=packed_view).retrieval, answer.retrieval):
+                assert retrieval[0].map_image == number
     with robot.session("seen") as session:
         session.observe(on_board=encoder.view(encoded(picture(5))))
         assert session.observe(on_board=encoder.view(encoded(picture(5))), action_m=0.0).belief.top[0].map_image == 5

@@ -5,10 +5,9 @@ import json
 import os
 import signal
 
-import httpx2
 import pytest
 
-from .conftest import JPEG, of_one_process, wait_until
+from .conftest import JPEG, TAKES_IMAGES, of_one_process, problem, wait_until
 from .server_process import ServerProcess
 
 MEBIBYTE = 1024 * 1024
@@ -19,8 +18,8 @@ HEAD = f"PUT {FRAME} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: image/jpeg\r\n
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
     with ServerProcess(tmp_path_factory.mktemp("wire") / "data") as process:
-        httpx2.put(f"{process.url}/v1/admin/domains/d", json={"evaluator": {"kind": "feature_l2"}})
-        httpx2.post(f"{process.url}/v1/admin/domains/d/traverses", json={"name": "t"})
+        process.client.make_domain("d", **TAKES_IMAGES)
+        process.client.post("/v1/admin/domains/d/traverses", json={"name": "t"})
         yield process
 
 
@@ -33,8 +32,7 @@ def test_a_declared_length_is_refused_before_a_byte_of_it(server):
 def test_a_sender_who_reads_only_after_its_last_byte_still_gets_the_answer(server):
     with server.limited(100):
         for content in (bytes(100 * MEBIBYTE), (bytes(65536) for _ in range(1600))):
-            answer = httpx2.put(f"{server.url}{FRAME}", content=content, headers=JPEG)
-            assert (answer.status_code, answer.json()["code"]) == (413, "body_too_large")
+            problem(server.client.put(FRAME, content=content, headers=JPEG), 413, "body_too_large")
 
 
 def test_a_small_unread_body_leaves_the_connection_open(server):

@@ -18,7 +18,7 @@ import pytest
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import KeyScope
 
-from .conftest import N_SEEN, service
+from .conftest import N_SEEN, TAKES_IMAGES, service
 from .server_process import ServerProcess
 
 pytestmark = pytest.mark.slow
@@ -103,12 +103,11 @@ def prepare(data_dir):
     """Make what the examples of the document are about: a domain mapped twice, its drives."""
     with service(data_dir) as client:
         client.make_ready_domain("spare")
-        client.put("/v1/admin/domains/campus", json={"evaluator": {"kind": "feature_l2"}})
+        client.make_domain("campus", **TAKES_IMAGES)
         for name in ("2012-05-11", "2012-08-20"):
             assert client.upload_pictures("campus", name) == [201] * N_SEEN
             drives = {"training_traverse": name, "landmark_traverse": name}
-            job = client.remap("campus", **drives, n_landmarks=N_SEEN, list_length=3)
-            assert job["state"] == "succeeded", job
+            client.make_map("campus", **drives, n_landmarks=N_SEEN, list_length=3)
 
 
 def schemathesis(url, folder, key):
@@ -143,7 +142,7 @@ def test_a_service_with_keys(tmp_path):
         _, admin = catalog.create_key(KeyScope.ADMIN)
     with ServerProcess(data_dir, SERVE) as server:
         assert schemathesis(server.url, tmp_path, admin.text) >= FEWEST_CASES
-        assert httpx2.get(f"{server.url}/readyz").status_code == 200
+        assert server.client.get("/readyz").status_code == 200
         assert '"request failed"' not in server.log_path.read_text()
         os.kill(server.pid, signal.SIGTERM)
         assert server.wait(60) == 0, server.log_path.read_text()

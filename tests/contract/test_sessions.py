@@ -15,11 +15,10 @@ from deepsimbad.api.app import create_app
 from .conftest import (
     DIM,
     IS_FLEET,
-    JPEG,
     N_LANDMARKS,
     N_READY,
     RANKS,
-    encoded,
+    image_body,
     of_one_process,
     path_of,
     picture,
@@ -35,6 +34,11 @@ STATE = {"session_id", "domain", "map_version", "n_observations", "expires_at", 
 
 def observe(client, path, action_m=0, **headers):
     return client.post(f"{path}/observations?action_m={action_m}", json=RANKS, headers=headers)
+
+
+def see(client, path, image, action_m=0.0, **query):
+    """An observation of what a map image shows, hardly changed."""
+    return client.observe(path, {"encoding": (ready_encodings()[image] + 0.1).tolist()}, action_m=action_m, **query)
 
 
 @of_one_process
@@ -58,10 +62,8 @@ def test_long_answers_of_every_route_are_written_beside_the_loop(client, monkeyp
     ]
     for shortlist, n_expected in ((20, 0), (21, 2 * len(calls))):  # rendered, and written as JSON
         for method, url, body in calls:
-            answer = client.request(method, url, params={"shortlist": shortlist}, json=body)
-            assert answer.status_code == 200, answer.text
-            belief = answer.json() if url.endswith("/belief") else answer.json()["belief"]
-            assert len(belief["top"]) == shortlist
+            answer = client.answer_to(method, url, params={"shortlist": shortlist}, json=body)
+            assert len(answer.get("belief", answer)["top"]) == shortlist
         assert n_beside == n_expected
 
 
@@ -74,9 +76,7 @@ def test_a_session_from_beginning_to_end(client):
     assert session["belief"]["entropy_bits"] == pytest.approx(math.log2(N_READY), abs=0.01)
 
     path = path_of(session)
-    answer = client.post(f"{path}/observations", json=RANKS, params={"shortlist": 3})
-    assert answer.status_code == 200, answer.text
-    first_answer = answer.json()
+    first_answer = client.observe(path, shortlist=3)
     assert set(first_answer) == STATE | {"timings_ms", "retrieval", "informative", "warnings"}
     assert first_answer["n_observations"] == 1
     assert len(first_answer["retrieval"]) == len(first_answer["belief"]["top"]) == 3
@@ -84,7 +84,7 @@ def test_a_session_from_beginning_to_end(client):
     assert relevance == sorted(relevance, reverse=True)
     assert set(first_answer["next_best_view"]) == {"planner", "action_m", "stop", "actions"}
 
-    second_answer = client.post(f"{path}/observations", json=RANKS, params={"action_m": 4, "action_std_m": 0.5}).json()
+    second_answer = client.observe(path, action_m=4, action_std_m=0.5)
     assert second_answer["n_observations"] == 2
     state = client.get(path).json()
     assert set(state) == STATE
@@ -97,12 +97,11 @@ def test_a_session_from_beginning_to_end(client):
     assert mass.sum() == pytest.approx(1)
     assert int(mass.argmax()) == second_answer["belief"]["top"][0]["map_image"]
 
-    prior = client.put(f"{path}/prior", json={"position_m": 30, "std_m": 2.5})
-    assert prior.status_code == 200
-    assert set(prior.json()) == STATE
-    assert (prior.json()["belief"]["mode_m"], prior.json()["n_observations"]) == (30, 2)
-    slack_prior = client.put(f"{path}/prior", json={"position_m": -2, "std_m": 1})
-    assert slack_prior.json()["belief"]["mode_m"] == 0, "a little beside the route is allowed"
+    prior = client.answer_to("PUT", f"{path}/prior", json={"position_m": 30, "std_m": 2.5})
+    assert set(prior) == STATE
+    assert (prior["belief"]["mode_m"], prior["n_observations"]) == (30, 2)
+    slack_prior = client.answer_to("PUT", f"{path}/prior", json={"position_m": -2, "std_m": 1})
+    assert slack_prior["belief"]["mode_m"] == 0, "a little beside the route is allowed"
 
     assert client.delete(path).status_code == 204
     for late_answer in (client.get(path), client.delete(path), observe(client, path)):
@@ -120,36 +119,21 @@ def test_a_start_a_planner_and_a_filter_may_be_chosen(client):
 
 
 def test_every_form_of_a_view(client):
-    ready_path, image_path = client.session(), client.session("seen")
-    for place, body in enumerate(({"dissimilarities": RANKS["ranked_landmarks"]}, {"encoding": [0.5] * DIM}, RANKS)):
-        answer = client.post(f"{ready_path}/observations", json=body)
-        assert answer.json()["n_observations"] == place + 1, answer.text
-    answer = client.post(f"{image_path}/observations", content=encoded(picture(4)), headers=JPEG)
-    assert answer.json()["belief"]["mode_m"] == 4
+    path = client.session()
+    for place, view in enumerate(({"dissimilarities": RANKS["ranked_landmarks"]}, {"encoding": [0.5] * DIM}, RANKS)):
+        assert client.observe(path, view)["n_observations"] == place + 1
+    assert client.observe(client.session("seen"), image_body(picture(4)))["belief"]["mode_m"] == 4
 
 
 @pytest.mark.parametrize("belief", ["grid", "particle"])
 def test_a_picture_of_nothing_says_nothing(client, belief):
     path = client.session("seen", belief=belief)
-    old_belief = client.post(f"{path}/observations", content=encoded(picture(4)), headers=JPEG).json()["belief"]
+    old_belief = client.observe(path, image_body(picture(4)))["belief"]
     for shade in (0, 90, 255):
-        blank = encoded(np.full((120, 160, 3), shade, np.uint8))
-        answer = client.post(f"{path}/observations", content=blank, headers=JPEG)
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["informative"] is False
-        assert answer.json()["warnings"][0] == "the view told nothing of the place"
-        new_belief = answer.json()["belief"]
-        assert new_belief["entropy_bits"] >= old_belief["entropy_bits"] - 1e-9
-        assert new_belief["mode_m"] == old_belief["mode_m"]
-
-
-def see(client, path, image, action_m=0.0, **query):
-    """An observation of what a map image shows, hardly changed."""
-    encoding = (ready_encodings()[image] + 0.1).tolist()
-    params = {"action_m": action_m, **query}
-    answer = client.post(f"{path}/observations", json={"encoding": encoding}, params=params)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
+        answer = client.observe(path, image_body(np.full((120, 160, 3), shade, np.uint8)))
+        assert (answer["informative"], answer["warnings"][0]) == (False, "the view told nothing of the place")
+        assert answer["belief"]["entropy_bits"] >= old_belief["entropy_bits"] - 1e-9
+        assert answer["belief"]["mode_m"] == old_belief["mode_m"]
 
 
 @pytest.mark.parametrize("belief", ["grid", "particle"])
@@ -232,12 +216,6 @@ def test_a_robot_that_was_carried_is_lost_and_found(client, belief):
     assert carried[-1]["belief"]["off_route"] < 0.5
 
 
-def test_nan_is_named_as_no_finite_number(client):
-    body = b'{"confidence": NaN}'
-    answer = client.post("/v1/domains/ready/sessions", content=body, headers={"Content-Type": "application/json"})
-    assert "confidence: Input should be a finite number" in problem(answer, 422, "invalid_request")["detail"]
-
-
 def test_metres_may_be_given_a_price(client):
     free_plan, dear_plan = (
         see(client, client.session(price_bits_per_m=price), 11)["next_best_view"] for price in (0, 100)
@@ -284,13 +262,9 @@ def test_an_idempotency_key_counts_once(client):
     answers = [observe(client, path, 1, **key).json() for _ in range(3)]
     assert [answer["n_observations"] for answer in answers] == [1, 1, 1]
     assert answers[0]["belief"] == answers[1]["belief"] == answers[2]["belief"]
-    other_requests = (
-        ("action_m=2", RANKS),
-        ("action_m=1&action_std_m=2", RANKS),
-        ("action_m=1", {"ranked_landmarks": [1]}),
-    )
-    for query, body in other_requests:
-        refused = client.post(f"{path}/observations?{query}", json=body, headers=key)
+    one_landmark = {"ranked_landmarks": [1]}
+    for query, body in (("2", RANKS), ("1&action_std_m=2", RANKS), ("1", one_landmark)):
+        refused = client.post(f"{path}/observations?action_m={query}", json=body, headers=key)
         problem(refused, 422, "idempotency_key_reused")
     assert observe(client, path).json()["n_observations"] == 2
     assert observe(client, path, 1, **key).json()["belief"] == answers[0]["belief"]
@@ -382,12 +356,8 @@ def test_a_restart_and_a_retired_map(tmp_path):
         assert client.get("/v1/domains/ready").json()["map_version"] == 2
         assert observe(client, path).json()["map_version"] == 1
     with service(tmp_path) as client:
-        repetition = observe(client, path, **key).json()
-        assert {**repetition, "timings_ms": {}, "expires_at": ""} == {
-            **first_answer,
-            "timings_ms": {},
-            "expires_at": "",
-        }
+        of_the_time = {"timings_ms": {}, "expires_at": ""}
+        assert observe(client, path, **key).json() | of_the_time == first_answer | of_the_time
         assert client.get(path).json()["n_observations"] == 2
         answer = client.post("/v1/domains/ready/sessions", **begin_under_key)
         assert (answer.status_code, answer.json()["session_id"]) == (201, session["session_id"])
@@ -437,9 +407,9 @@ def test_a_robot_that_goes_backward_is_followed(client, back_and_forth, belief):
     far_move = observe(client, path, -50)
     if closed:
         assert far_move.status_code == 200, far_move.text
-    else:
-        document = problem(far_move, 422, "past_the_end")
-        assert (document["route_end_m"], "the route begins at 0 m" in document["detail"]) == (0, True)
+        return
+    document = problem(far_move, 422, "past_the_end")
+    assert (document["route_end_m"], "the route begins at 0 m" in document["detail"]) == (0, True)
 
 
 @pytest.mark.parametrize("planner", ["informed", "nnql", "random", "constant:-6", "constant:0"])
@@ -457,10 +427,8 @@ def test_every_planner_chooses_among_all_moves_and_staying_is_no_stop(client, ba
         bits = {action["action_m"]: action["expected_bits"] for action in plan["actions"]}
         assert bits[0] == 0 < min(bits[-6], bits[2], bits[10])
         dear_path = client.session(name, planner=planner, confidence=0.999999, price_bits_per_m=100)
-        dear_plan = see(client, dear_path, 20)["next_best_view"]
-        assert (dear_plan["action_m"], dear_plan["stop"]) == (0, False), (
-            "moving is too dear, and the place is not known"
-        )
+        plan = see(client, dear_path, 20)["next_best_view"]
+        assert (plan["action_m"], plan["stop"]) == (0, False), "moving is too dear, and the place is not known"
     sure_path = client.session(name, planner=planner, confidence=0.5, start_position_m=40, start_std_m=0.1)
     assert see(client, sure_path, 20)["next_best_view"]["stop"] is True, "whatever the next move would be"
     problem(client.post(f"/v1/domains/{name}/sessions", json={"planner": "constant:-2"}), 422, "invalid_input")

@@ -32,12 +32,8 @@ def client_b(tmp_path, store, client_a):
         yield client
 
 
-def answer_of(client, path=LOCALIZATIONS):
-    answer = client.post(path, json=RANKS)
-    assert answer.status_code == 200, answer.text
-    document = answer.json()
-    document.pop("timings_ms")
-    return document
+def answer_of(client):
+    return client.localize() | {"timings_ms": None}
 
 
 def is_active(client, domain):
@@ -72,13 +68,13 @@ def test_what_one_activates_the_other_serves(client_a, client_b):
     assert client_a.remap("ready", landmark_traverse="drive", n_landmarks=N_LANDMARKS)["result"]["map_version"] == 2
     wait_for_version(client_b, 2)
     assert answer_of(client_b) == answer_of(client_a)
-    assert answer_of(client_b, f"{session}/observations")["map_version"] == 1, "a session keeps the map it began on"
+    assert client_b.observe(session)["map_version"] == 1, "a session keeps the map it began on"
     assert activate(client_a, 1, 2).status_code == 200
     problem(activate(client_b, 2, 2), 409, "lost_activation")
     wait_for_version(client_b, 1)
     assert activate(client_b, 2, 1).status_code == 200, "from anywhere"
     wait_for_version(client_a, 2)
-    assert client_a.put("/v1/admin/domains/unmapped", json={"evaluator": {"kind": "feature_l2"}}).status_code == 201
+    client_a.make_domain("unmapped")
     wait_until(lambda: client_b.get("/v1/domains/unmapped").status_code == 200)
     problem(answer_once_known(client_b, "unmapped"), 409, "no_active_map")
     assert client_a.delete("/v1/admin/domains/ready").status_code == 204
@@ -92,11 +88,10 @@ def test_a_service_without_its_store_serves_what_it_has_and_says_what_it_has_not
     answer = answer_of(client_b)
     shutil.move(store, store.with_name("lost"))
     assert answer_of(client_b) == answer
-    session = client_b.session()
-    assert answer_of(client_b, f"{session}/observations")["map_version"] == 1
-    response = client_b.post("/v1/domains/cold/localizations", json=RANKS)
-    problem(response, 503, "unavailable")
-    assert response.headers["retry-after"]
+    assert client_b.observe(client_b.session())["map_version"] == 1
+    answer_while_away = client_b.post("/v1/domains/cold/localizations", json=RANKS)
+    problem(answer_while_away, 503, "unavailable")
+    assert answer_while_away.headers["retry-after"]
     problem(activate(client_a, 1, 1), 503, "unavailable")
     problem(client_a.delete("/v1/admin/domains/ready"), 503, "unavailable")
     job = client_a.remap("ready")

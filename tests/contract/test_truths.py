@@ -32,19 +32,15 @@ class Walk:
         self.shares = []
         self.retrievals = []
         for view in range(n_views):
-            body = {"encoding": (ready_encodings()[2 * view] + 0.8).tolist()}
-            url = f"{self.path}/observations?action_m={STEP_M}&shortlist={N_READY}"
-            answer = client.post(url, json=body)
-            assert answer.status_code == 200, answer.text
-            document = answer.json()
+            encoding = (ready_encodings()[2 * view] + 0.8).tolist()
+            document = client.observe(self.path, {"encoding": encoding}, action_m=STEP_M, shortlist=N_READY)
             self.retrievals.append({place["map_image"]: place["relevance"] for place in document["retrieval"]})
             mass = {place["map_image"]: place["mass"] for place in document["belief"]["top"]}
             self.shares.append(rank(mass, [2 * view]) / N_READY)
 
     def post_truths(self, positions_m, **options):
-        answer = self._client.post(f"{self.path}/truths", json={"true_positions_m": positions_m, **options})
-        assert answer.status_code == 200, answer.text
-        return answer.json()
+        body = {"true_positions_m": positions_m, **options}
+        return self._client.answer_to("POST", f"{self.path}/truths", json=body)
 
     def metric(self):
         """The live ANR metric of the domain: the number of observations, and the sum of their ranks in percent."""
@@ -91,8 +87,8 @@ def test_each_view_is_ranked_by_the_map_images_told(client, domain):
     assert ranks(0, 6) == expected
     assert ranks(3, 6) == expected[3:]
     client.put(f"{walk.path}/prior", json={"position_m": 3.0, "std_m": 1.0})
-    body = {"encoding": ready_encodings()[12].tolist()}
-    assert client.post(f"{walk.path}/observations", json=body).json()["retrieval"][0]["map_image"] == 12
+    answer = client.observe(walk.path, {"encoding": ready_encodings()[12].tolist()})
+    assert answer["retrieval"][0]["map_image"] == 12
     images.append([12])
     assert ranks(6, 7) == [0]
     client.delete(walk.path)
@@ -139,10 +135,12 @@ def test_an_observation_is_counted_once_whoever_tells(client, domain, monkeypatc
 def test_a_deleted_domain_takes_its_series_along(client, domain):
     walk = Walk(client, domain)
     walk.post_truths(walk.positions_m)
+    assert f'domain="{domain}"' in client.get("/metrics").text
     assert client.delete(f"/v1/admin/domains/{domain}").status_code == 204
     assert f'domain="{domain}"' not in client.get("/metrics").text
     answer = client.post(f"{walk.path}/truths", json={"true_positions_m": walk.positions_m})
     problem(answer, 410, "retired_map")
+    client.services.metrics.record_localization(domain, {"plan": 1.0}, 2.0)  # a view that was on its way
     assert f'domain="{domain}"' not in client.get("/metrics").text
 
 
@@ -191,7 +189,7 @@ def test_the_next_map_learns_from_a_session(client, domain):
     # A session on the older version may be fed back too: its landmarks are the same. A prior begins another walk.
     client.put(f"{walk.path}/prior", json={"position_m": 8, "std_m": 1})
     for _ in range(2):
-        client.post(f"{walk.path}/observations", json={"ranked_landmarks": [1, 2, 3]})
+        client.observe(walk.path, {"ranked_landmarks": [1, 2, 3]})
     client.delete(walk.path)  # and an ended one as well
     result = client.wait_for(walk.learn([*walk.positions_m, 8.0, 8.0]).json()["job_id"])["result"]
     assert (result["map_version"], result["metrics"]["experience"]["n_walks"]) == (3, 2)

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-from .conftest import DIM, TAKES_ENCODINGS, service
+from .conftest import DIM, service
 
 FIRST_REQUESTS = """
 import importlib, json, pkgutil, sys
@@ -43,7 +43,7 @@ def test_no_kernel_is_compiled_after_the_service_is_ready(tmp_path):
     places = random.normal(size=(80, DIM))
     with service(tmp_path) as client:
         for domain, position_m in (("even", np.arange(80.0)), ("uneven", np.arange(80.0) ** 1.05)):
-            client.put(f"/v1/admin/domains/{domain}", json=TAKES_ENCODINGS)
+            client.make_domain(domain)
             for season in ("summer", "winter"):
                 encodings = (places + 0.1 * random.normal(size=places.shape)).astype(np.float32)
                 client.upload(domain, season, encodings, position_m)

@@ -8,16 +8,15 @@ import pytest
 from deepsimbad.core.atlas import posterior
 from deepsimbad.store.records import KeyScope
 
-from .conftest import JPEG, JSON, TAKES_ENCODINGS, encoded, picture, problem, ready_encodings, service
+from .conftest import JPEG, JSON, TAKES_IMAGES, image_body, picture, problem, ready_encodings, service
 
 URL = "/v1/localizations"
 FAR = 30.0  # how differently the other route looks
 
 
 def answer_of(client, body, domains=None, **params):
-    answer = client.post(URL, params=params, json={**body, **({} if domains is None else {"domains": domains})})
-    assert answer.status_code == 200, answer.text
-    document = answer.json()
+    of = {} if domains is None else {"domains": domains}
+    document = client.answer_to("POST", URL, params=params, json={**body, **of})
     likely_probability = sum(domain["probability"] for domain in document["domains"])
     assert likely_probability + document["others"]["probability"] + document["elsewhere"] == pytest.approx(1)
     assert document["n_left_out"] >= len(document["left_out"])
@@ -25,10 +24,9 @@ def answer_of(client, body, domains=None, **params):
 
 
 def make_domain(client, name, encodings, **config):
-    assert client.put(f"/v1/admin/domains/{name}", json=TAKES_ENCODINGS).status_code == 201
-    client.upload(name, "drive", encodings, np.arange(len(encodings)) * 1.0)
-    job = client.remap(name, landmark_traverse="drive", **config)
-    assert job["state"] == "succeeded", job
+    client.make_domain(name)
+    client.upload(name, "drive", np.float32(encodings), np.arange(len(encodings)) * 1.0)
+    client.make_map(name, landmark_traverse="drive", **config)
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +37,18 @@ def routes(tmp_path_factory):
         client.encodings = {"a": rng.normal(size=(60, 32)), "b": rng.normal(size=(90, 32))}
         client.encodings |= {"far": FAR + rng.normal(size=(50, 32)), "long": rng.normal(size=(50, 40))}
         for name, encodings in client.encodings.items():
-            make_domain(client, name, encodings.astype(np.float32), n_landmarks=30, list_length=4)
-        client.put("/v1/admin/domains/unmapped", json=TAKES_ENCODINGS)
+            make_domain(client, name, encodings, n_landmarks=30, list_length=4)
+        client.make_domain("unmapped")
         yield client
 
 
 def view_of(client, name, at):
     return {"encoding": client.encodings[name][at].tolist()}
+
+
+def code_by_domain(answer):
+    """Why domains were left out, by their names."""
+    return {entry["domain"]: entry["code"] for entry in answer["left_out"]}
 
 
 def test_a_view_is_of_the_domain_that_it_comes_from_and_where_that_says(routes):
@@ -54,33 +57,24 @@ def test_a_view_is_of_the_domain_that_it_comes_from_and_where_that_says(routes):
             answer = answer_of(routes, view_of(routes, name, at))
             best = answer["domains"][0]
             assert (best["domain"], best["map_version"]) == (name, 1)
-            assert best["probability"] > 0.5
-            assert best["log_evidence"] > 0
-            assert answer["top"][0]["domain"] == name
-            own_answer = routes.post(f"/v1/domains/{name}/localizations", json=view_of(routes, name, at)).json()
+            assert (best["probability"] > 0.5, best["log_evidence"] > 0) == (True, True)
+            own_answer = routes.localize(name, view_of(routes, name, at))
             for member in ("belief", "retrieval", "informative", "next_best_view"):
                 assert best[member] == own_answer[member], member
             masses = [place["mass"] for place in answer["top"]]
             assert masses == sorted(masses, reverse=True)
             first = best["belief"]["top"][0]
             assert answer["top"][0] == {**first, "domain": name, "mass": first["mass"] * best["probability"]}
-            assert {entry["domain"]: entry["code"] for entry in answer["left_out"]} == {
-                "long": "invalid_encoding",
-                "unmapped": "no_active_map",
-            }
+            assert code_by_domain(answer) == {"long": "invalid_encoding", "unmapped": "no_active_map"}
             assert answer["n_left_out"] == 2
 
 
 def test_one_domain_named_answers_as_its_own_call(routes):
     view = view_of(routes, "a", 12)
     answer = answer_of(routes, view, ["a"], shortlist=4)
-    own_answer = routes.post("/v1/domains/a/localizations", params={"shortlist": 4}, json=view).json()
+    own_answer = routes.localize("a", view, shortlist=4)
     (best,) = answer["domains"]
-    assert {**own_answer, "timings_ms": None} == {
-        "timings_ms": None,
-        "warnings": [],
-        **{member: best[member] for member in own_answer if member not in {"timings_ms", "warnings"}},
-    }
+    assert best | own_answer == {**best, "timings_ms": own_answer["timings_ms"], "warnings": []}
     assert (answer["others"], answer["n_left_out"]) == ({"n_domains": 0, "probability": 0.0}, 0)
     (probability,), elsewhere_probability = posterior({"a": best["log_evidence"]})[0].values(), answer["elsewhere"]
     assert (best["probability"], elsewhere_probability) == pytest.approx((probability, 1 - probability))
@@ -110,31 +104,38 @@ def test_a_view_of_none_of_the_routes_is_elsewhere(routes):
 
 def test_domains_are_named_in_the_body_or_beside_it(routes):
     view = view_of(routes, "a", 3)
-    in_body, in_query = answer_of(routes, view, ["a", "b"]), answer_of(routes, view, domains=["a", "b"])
-    answers = [answer_of(routes, view), answer_of(routes, view, "*"), answer_of(routes, view, domains="*")]
-    for answer, other in ((in_body, in_query), *((answers[0], other) for other in answers[1:])):
-        assert {**answer, "timings_ms": 0} == {**other, "timings_ms": 0}
-    assert next(domain["domain"] for domain in answers[0]["domains"]) == "a"
+
+    def answer(body=(), **query):
+        return routes.answer_to("POST", URL, params=query, json={**view, **dict(body)}) | {"timings_ms": 0}
+
+    assert answer({"domains": ["a", "b"]}) == answer(domains=["a", "b"])
+    assert answer() == answer({"domains": "*"}) == answer(domains="*")
+    assert answer()["domains"][0]["domain"] == "a"
     twice = routes.post(URL, params={"domains": "a"}, json={**view, "domains": ["b"]})
     problem(twice, 422, "invalid_request")
 
 
-@pytest.mark.parametrize("domains", [[], [""], ["../a"], "a", 3, ["*"], None, [1]])
-def test_domains_that_cannot_be(routes, domains):
-    problem(routes.post(URL, json={**view_of(routes, "a", 0), "domains": domains}), 422, "invalid_request")
+@pytest.mark.parametrize(
+    ("domains", "status", "code"),
+    [
+        *((domains, 422, "invalid_request") for domains in ([], [""], ["../a"], "a", 3, ["*"], None, [1])),
+        (["a", "nowhere"], 404, "unknown_domain"),
+        (["unmapped"], 409, "no_active_map"),
+        (["long"], 422, "invalid_encoding"),
+        (["long", "unmapped"], 409, "no_domain_answers"),
+    ],
+)
+def test_domains_that_cannot_be_asked_are_named(routes, domains, status, code):
+    document = problem(routes.post(URL, json={**view_of(routes, "a", 0), "domains": domains}), status, code)
+    assert code != "unknown_domain" or "nowhere" in document["detail"]
+    assert code != "no_domain_answers" or [entry["domain"] for entry in document["left_out"]] == domains
 
 
-def test_who_cannot_be_asked_is_named(routes):
-    view = view_of(routes, "a", 0)
-    document = problem(routes.post(URL, json={**view, "domains": ["a", "nowhere"]}), 404, "unknown_domain")
-    assert "nowhere" in document["detail"]
-    problem(routes.post(URL, json={**view, "domains": ["unmapped"]}), 409, "no_active_map")
-    problem(routes.post(URL, json={**view, "domains": ["long"]}), 422, "invalid_encoding")
-    nobody = problem(routes.post(URL, json={**view, "domains": ["long", "unmapped"]}), 409, "no_domain_answers")
-    assert [entry["domain"] for entry in nobody["left_out"]] == ["long", "unmapped"]
+def test_bodies_that_cannot_be(routes):
     problem(routes.post(URL, json={"domains": ["a"]}), 422, "invalid_request")
     problem(routes.post(URL, content=b"", headers=JSON), 422, "empty_body")
-    problem(routes.post(URL, json={**view, "domains": ["a"]}, params={"in_full": 0}), 422, "invalid_request")
+    view = {**view_of(routes, "a", 0), "domains": ["a"]}
+    problem(routes.post(URL, json=view, params={"in_full": 0}), 422, "invalid_request")
     problem(routes.post(URL, content=b"\xff\xd8", headers=JPEG), 409, "no_domain_answers")
 
 
@@ -145,34 +146,30 @@ def test_ranks_are_of_one_landmark_model(routes):
     digest = routes.get("/v1/domains/a").json()["landmark_model_digest"]
     answer = routes.post(URL, json=ranks, headers={"If-Match": f'"{digest}"'}).json()
     assert [domain["domain"] for domain in answer["domains"]] == ["a"]
-    assert {entry["domain"]: entry["code"] for entry in answer["left_out"]}["b"] == "landmark_model_differs"
+    assert code_by_domain(answer)["b"] == "landmark_model_differs"
 
 
 def test_a_remap_a_deletion_and_damage_are_seen_at_the_next_call(routes):
     view = view_of(routes, "a", 5)
     for name in ("gone", "hurt", "new"):
-        make_domain(routes, name, routes.encodings["a"].astype(np.float32), n_landmarks=30)
+        make_domain(routes, name, routes.encodings["a"], n_landmarks=30)
     answer_of(routes, view, in_full=100)
     assert routes.delete("/v1/admin/domains/gone").status_code == 204
-    assert routes.remap("new", landmark_traverse="drive", n_landmarks=20)["state"] == "succeeded"
+    routes.make_map("new", landmark_traverse="drive", n_landmarks=20)
     routes.services.catalog.map_path("hurt", 1).unlink()
     answer_of(routes, view, ["a"])
     gc.collect()  # nobody holds the others now
     routes.services.maps.forget("hurt")
     answer = answer_of(routes, view, in_full=100)
-    assert {domain["domain"]: domain["map_version"] for domain in answer["domains"]} == {
-        "a": 1,
-        "b": 1,
-        "far": 1,
-        "new": 2,
-    }
-    assert {entry["domain"]: entry["code"] for entry in answer["left_out"]}["hurt"] == "damaged_map"
+    versions = {domain["domain"]: domain["map_version"] for domain in answer["domains"]}
+    assert versions == {"a": 1, "b": 1, "far": 1, "new": 2}
+    assert code_by_domain(answer)["hurt"] == "damaged_map"
     for name in ("hurt", "new"):
         routes.delete(f"/v1/admin/domains/{name}")
 
 
 def test_a_relevance_that_compares_with_no_other_is_left_out(routes):
-    make_domain(routes, "paper", routes.encodings["a"].astype(np.float32), n_landmarks=30, relevance="rrf")
+    make_domain(routes, "paper", routes.encodings["a"], n_landmarks=30, relevance="rrf")
     answer = answer_of(routes, view_of(routes, "a", 5), ["a", "paper"])
     assert [entry["domain"] for entry in answer["left_out"]] == ["paper"]
     assert "rrf" in answer["left_out"][0]["detail"]
@@ -186,16 +183,16 @@ def test_a_view_that_shows_nothing_leaves_all_as_probable_as_before(routes):
 
 
 def test_an_image_is_encoded_once_for_all_domains_of_an_extractor(client, monkeypatch):
-    client.put("/v1/admin/domains/seen-too", json={"evaluator": {"kind": "feature_l2"}})
+    client.make_domain("seen-too", **TAKES_IMAGES)
     client.upload_pictures("seen-too", "drive")
     client.remap("seen-too", landmark_traverse="drive", n_landmarks=6, list_length=3)
     evaluator = client.services.evaluators.evaluator({"kind": "feature_l2"})
     encode, n_encoded = type(evaluator).encode, []
     monkeypatch.setattr(type(evaluator), "encode", lambda self, images: n_encoded.append(1) or encode(self, images))
-    image_request = {"content": encoded(picture(7)), "headers": JPEG}
-    answer = client.post(URL, params={"domains": ["seen", "seen-too", "ready"]}, **image_request).json()
+    domains = {"domains": ["seen", "seen-too", "ready"]}
+    answer = client.answer_to("POST", URL, params=domains, **image_body(picture(7)))
     assert {domain["domain"] for domain in answer["domains"]} == {"seen", "seen-too"}
-    assert {entry["domain"]: entry["code"] for entry in answer["left_out"]} == {"ready": "unsupported_media_type"}
+    assert code_by_domain(answer) == {"ready": "unsupported_media_type"}
     assert len(n_encoded) == 1
     assert answer["top"][0]["map_image"] == 7
     client.delete("/v1/admin/domains/seen-too")
@@ -222,11 +219,10 @@ def test_maps_give_way_and_warming_brings_them_back(tmp_path):
         answer = answer_of(client, view, ["a", "b"])
         assert len(answer["domains"]) == 2, "those that are named are read whatever room there is"
         assert client.services.maps.n_loaded == 1
-        full_answer = answer_of(client, view)
-        assert [entry["code"] for entry in full_answer["left_out"]] == ["not_loaded"]
-        (cold_name,) = (entry["domain"] for entry in full_answer["left_out"])
+        ((cold_name, code),) = code_by_domain(answer_of(client, view)).items()
+        assert code == "not_loaded"
         assert client.post(f"/v1/admin/domains/{cold_name}/warm").status_code == 202
         assert client.services.maps.peek(cold_name) is not None
         problem(client.post("/v1/admin/domains/nowhere/warm"), 404, "unknown_domain")
-        client.put("/v1/admin/domains/unmapped", json=TAKES_ENCODINGS)
+        client.make_domain("unmapped")
         problem(client.post("/v1/admin/domains/unmapped/warm"), 409, "no_active_map")

@@ -3,10 +3,8 @@
 import json
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +15,8 @@ from deepsimbad_client.errors import TraverseInUseError
 from deepsimbad_client.http.local_server import LocalServer
 from deepsimbad_client.http.models import Job
 
-WITHIN_S = 60
+from ..contract.conftest import wait_until
+
 N_FRAMES, DIM = 400, 64
 CONFIG = {"training_traverse": "drive", "landmark_traverse": "other", "n_landmarks": 30}
 LONG, SHORT = 1_000_000, 300  # training episodes; the map's size bounds the former, at some seconds
@@ -44,25 +43,13 @@ def server(tmp_path: Path) -> Iterator[LocalServer]:
         yield running
 
 
-def wait_until(look: Callable[[], Any]) -> Any:
-    give_up = time.monotonic() + WITHIN_S
-    while not (result := look()):
-        assert time.monotonic() < give_up
-        time.sleep(0.02)
-    return result
-
-
-def log_of(server: LocalServer) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in server.log_path.read_text(encoding="utf-8").splitlines()]
-
-
 def training(server: LocalServer, client: Client) -> tuple[Job, int]:
     """A job that is training its experience database, and the id of its process."""
     job = client.admin.remap("campus", **CONFIG, training_episodes=LONG)
     wait_until(lambda: client.admin.job(job.job_id).stage == "train")
-    started = [line for line in log_of(server) if line["message"] == "a job's process started"]
-    (start_line,) = [line for line in started if line["job_id"] == job.job_id]
-    return job, start_line["pid"]
+    log = map(json.loads, server.log_path.read_text(encoding="utf-8").splitlines())
+    (pid,) = (line["pid"] for line in log if "a job's process started" in line.values() and job.job_id in line.values())
+    return job, pid
 
 
 def is_gone(pid: int) -> bool:

@@ -76,11 +76,6 @@ def test_a_map_made_here_equals_one_made_over_http(campus, service, tmp_path):
         with Catalog.open(folder) as catalog:
             maps.append(read_map(catalog.map_path("campus", 1)))
     over_http, local = maps
-    assert np.array_equal(over_http.lists, local.lists)
     assert np.array_equal(over_http.landmark_model["prototypes"], local.landmark_model["prototypes"])
-    assert np.array_equal(over_http.statistics, local.statistics)
-    assert np.array_equal(over_http.usual_encoding, local.usual_encoding)
-    assert np.array_equal(over_http.view_bits, local.view_bits)
-    assert np.array_equal(over_http.position_m, local.position_m)
-    assert np.array_equal(over_http.x_m, local.x_m)
-    assert np.array_equal(over_http.timestamp_us, local.timestamp_us)
+    for name in ("lists", "statistics", "usual_encoding", "view_bits", "position_m", "x_m", "timestamp_us"):
+        assert np.array_equal(getattr(over_http, name), getattr(local, name)), name

@@ -1,11 +1,10 @@
 """A catalog, maps made without a job, and a service over them that can be restarted."""
 
-import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +15,9 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.engine.localizer import RankedLandmarks, ReadyEncoding, View
 from deepsimbad.engine.maps import Maps
-from deepsimbad.engine.session import Observation, SessionConfig
+from deepsimbad.engine.session import Observation, SessionConfig, SessionView
 from deepsimbad.engine.sessions import Sessions
-from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker
+from deepsimbad.engine.worker import EvaluatorPool, InferenceWorker, Stopwatch
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.store.catalog import Catalog
@@ -26,7 +25,6 @@ from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.map_file import seal, write_map
 from deepsimbad.store.sessions import IdempotencyKey, SessionStore
 
-T = TypeVar("T")
 N_IMAGES, N_LANDMARKS, DIM, LIST_LENGTH = 30, 9, 6, 3
 EVALUATOR = {"kind": "feature_l2", "extractor": "none"}
 TTL_S, KEEP_ENDED_S = 100.0, 50_000.0
@@ -112,6 +110,10 @@ class Service:
     async def begin(self, **config: Any) -> str:
         return (await self.sessions.begin(self.maps.active("d"), SessionConfig(**config))).session_id
 
+    async def observe(self, session_id: str, seed: int, watch: Stopwatch | None = None, **options: Any) -> SessionView:
+        """An observation of ranks, the same for the same seed."""
+        return await self.sessions.observe(session_id, ranked_observation(seed, **options), watch)
+
 
 @contextmanager
 def open_service(catalog: Catalog, clock: Clock | None = None, **options: Any) -> Iterator[Service]:
@@ -124,12 +126,16 @@ def open_service(catalog: Catalog, clock: Clock | None = None, **options: Any) -
         service.store.close()
 
 
-def run(
-    catalog: Catalog, body: Callable[[Service], Coroutine[Any, Any, T]], clock: Clock | None = None, **options: Any
-) -> T:
-    """Run a coroutine against a service that is started for it, and stopped after it."""
-    with open_service(catalog, clock, **options) as service:
-        return asyncio.run(body(service))
+@pytest.fixture
+def service(mapped_catalog: Catalog, clock: Clock) -> Iterator[Service]:
+    """A service over the catalog with one map."""
+    with open_service(mapped_catalog, clock) as service:
+        yield service
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
 
 
 def view_decoder(view: View) -> Callable[[Evaluator, Map], Awaitable[tuple[View, Sequence[str]]]]:

@@ -20,11 +20,6 @@ EYES = FeatureL2("gradient_grid")
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def anyio_backend():
-    return "asyncio"
-
-
 async def wait_until(condition):
     for _ in range(6000):
         if condition():

@@ -1,8 +1,7 @@
 """Truths ranked in a session's beliefs, compared with ranks from the journal replayed naively."""
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -14,11 +13,20 @@ from deepsimbad.engine import session as session_module
 from deepsimbad.engine.session import Observation
 from deepsimbad.engine.truths import Truths, true_images
 from deepsimbad.engine.worker import Priority
-from deepsimbad.store.catalog import Catalog
 
-from .conftest import Clock, Service, add_domain, add_map, encoding_observation, map_contents, ranked_observation, run
+from .conftest import (
+    Clock,
+    Service,
+    add_domain,
+    add_map,
+    encoding_observation,
+    map_contents,
+    open_service,
+    ranked_observation,
+)
 
 NAN = math.nan
+pytestmark = pytest.mark.anyio
 
 
 def truths_of(service: Service) -> Truths:
@@ -50,80 +58,65 @@ def slow_share(mass: NDArray[np.float64], route: Route, position_m: float) -> fl
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("belief", list(FilterKind))
 @pytest.mark.parametrize("n_views", [1, 70])  # 70: more than one read of the journal
-def test_every_truth_is_ranked_in_the_belief_of_its_time(
-    catalog: Catalog, closed: bool, belief: FilterKind, n_views: int
-) -> None:
+async def test_every_truth_is_ranked_in_the_belief_of_its_time(catalog, closed, belief, n_views):
     add_domain(catalog, "d", closed)
     add_map(catalog, contents=map_contents(closed=closed))
     views = [ranked_observation(seed, 0.5) if seed % 2 else encoding_observation(seed, 0.4) for seed in range(n_views)]
-
-    async def body(service: Service) -> None:
+    positions_m = [0.41 + 0.6 * number if number != 2 else None for number in range(n_views)]
+    with open_service(catalog, max_sessions=2) as service:
         session_id, masses = await drive_session(service, views, priors=[4], belief=belief)
         route = service.maps.active("d").snapshot.route
-        positions_m: list[float | None] = [0.41 + 0.6 * number for number in range(n_views)]
-        if n_views > 3:
-            positions_m[2] = None
         truths = await truths_of(service).rank(session_id, positions_m)
-        expected = [
-            NAN if position_m is None else slow_share(mass, route, position_m)
-            for mass, position_m in zip(masses, positions_m, strict=True)
-        ]
-        np.testing.assert_allclose(truths.rank_share, expected, atol=1e-12)
-        assert (truths.session.domain, truths.session.map_version) == ("d", 1)
-        assert truths.n_left_out == positions_m.count(None)
-        assert truths.n_scored + truths.n_left_out == n_views
-        assert truths.anr == pytest.approx(100 * np.nanmean(expected))
-
-    run(catalog, body, max_sessions=2)
+    expected = [
+        NAN if position_m is None else slow_share(mass, route, position_m)
+        for mass, position_m in zip(masses, positions_m, strict=True)
+    ]
+    np.testing.assert_allclose(truths.rank_share, expected, atol=1e-12)
+    assert (truths.session.domain, truths.session.map_version) == ("d", 1)
+    n_left_out = positions_m.count(None)
+    assert (truths.n_left_out, truths.n_scored) == (n_left_out, n_views - n_left_out)
+    assert truths.anr == pytest.approx(100 * np.nanmean(expected))
 
 
-def test_a_live_view_goes_before_the_rest_of_a_replay(mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_live_view_goes_before_the_rest_of_a_replay(service, monkeypatch):
     """Whoever comes while a session is replayed waits for a piece of it, not for all."""
     monkeypatch.setattr(session_module, "_PIECE_S", 0.0)
+    session_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(9)])
+    order, submit = [], service.worker.submit
 
-    async def body(service: Service) -> None:
-        session_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(9)])
-        order: list[str] = []
-        submit = service.worker.submit
+    def noting(run, priority=Priority.LIVE):
+        def noted():
+            if priority is Priority.BATCH and order.count("BATCH") == 3:
+                submit(lambda: order.append("LIVE"))  # a view comes in the middle
+            order.append(priority.name)
+            return run()
 
-        def noting(run: Callable[[], object], priority: Priority = Priority.LIVE) -> Future[object]:
-            def noted() -> object:
-                if priority is Priority.BATCH and order.count("BATCH") == 3:
-                    submit(lambda: order.append("LIVE"))  # a view comes in the middle
-                order.append(priority.name)
-                return run()
+        return submit(noted, priority)
 
-            return submit(noted, priority)
-
-        service.worker.submit = noting  # type: ignore[method-assign,assignment]
-        await truths_of(service).rank(session_id, [1.0] * 9)
-        assert order == ["BATCH"] * 4 + ["LIVE"] + ["BATCH"] * 6  # the start, then a row a piece
-
-    run(mapped_catalog, body)
+    monkeypatch.setattr(service.worker, "submit", noting)
+    await truths_of(service).rank(session_id, [1.0] * 9)
+    assert order == ["BATCH"] * 4 + ["LIVE"] + ["BATCH"] * 6  # the start, then a row a piece
 
 
-def test_a_truth_on_a_closed_route_may_be_any_number_of_rounds_on() -> None:
+def test_a_truth_on_a_closed_route_may_be_any_number_of_rounds_on():
     positions_m = np.array([0.2, 4.2, 8.2, -3.8, 3.8, NAN])
     assert true_images(Route(np.arange(4.0), closed=True), positions_m).tolist() == [0, 0, 0, 0, 0, 0]
     assert true_images(Route(np.arange(4.0)), np.array([-9.0, 1.4, 77.0])).tolist() == [0, 1, 3]
 
 
-def test_truths_told_bit_by_bit_follow_a_session_once(mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def body(service: Service) -> None:
-        session_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(6)])
-        ranking = await truths_of(service).rank(session_id, [1.0] * 6)
-        journal, first_rows = service.store.journal, []
+async def test_truths_told_bit_by_bit_follow_a_session_once(service, monkeypatch):
+    session_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(6)])
+    ranking = await truths_of(service).rank(session_id, [1.0] * 6)
+    journal, first_rows = service.store.journal, []
 
-        def noting(number: int, sequence: int, last_sequence: int) -> object:
-            first_rows.append(sequence)
-            return journal(number, sequence, last_sequence)
+    def noting(number, sequence, last_sequence):
+        first_rows.append(sequence)
+        return journal(number, sequence, last_sequence)
 
-        monkeypatch.setattr(service.store, "journal", noting)
-        truths = truths_of(service)
-        await truths.rank(session_id, [1.0] * 3 + [None] * 3)
-        last_ranking = await truths.rank(session_id, [1.0] * 3, first=3)
-        assert first_rows == [0, 3]
-        np.testing.assert_array_equal(last_ranking.rank_share[3:], ranking.rank_share[3:])
-        assert last_ranking.n_left_out == 0
-
-    run(mapped_catalog, body)
+    monkeypatch.setattr(service.store, "journal", noting)
+    truths = truths_of(service)
+    await truths.rank(session_id, [1.0] * 3 + [None] * 3)
+    last_ranking = await truths.rank(session_id, [1.0] * 3, first=3)
+    assert first_rows == [0, 3]
+    np.testing.assert_array_equal(last_ranking.rank_share[3:], ranking.rank_share[3:])
+    assert last_ranking.n_left_out == 0

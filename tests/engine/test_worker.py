@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -13,9 +14,8 @@ from deepsimbad.errors import InvalidImageError, InvalidInputError, OverloadedEr
 
 @pytest.fixture
 def worker() -> Iterator[InferenceWorker]:
-    inference_worker = InferenceWorker(max_waiting=16)
-    yield inference_worker
-    inference_worker.close()
+    with closing(InferenceWorker(max_waiting=16)) as inference_worker:
+        yield inference_worker
 
 
 def test_live_goes_before_batch_and_each_in_order_of_arrival(worker: InferenceWorker) -> None:
@@ -121,22 +121,18 @@ def test_images_that_wait_are_encoded_together_as_many_as_pay(worker: InferenceW
 
 
 def test_where_batches_do_not_pay_nobody_waits_for_company() -> None:
-    worker, eyes = InferenceWorker(longest_wait_s=3600), Eyes(largest_batch=1)
-    try:
+    eyes = Eyes(largest_batch=1)
+    with closing(InferenceWorker(longest_wait_s=3600)) as worker:
         answers = [worker.encode(eyes, grey(level)) for level in range(3)]
         assert [answer.result(60).values[0] for answer in answers] == [0, 1, 2]
-        assert eyes.batches == [1, 1, 1]
-    finally:
-        worker.close()
+    assert eyes.batches == [1, 1, 1]
 
 
 def test_an_image_waits_for_company_no_longer_than_it_may() -> None:
-    worker, eyes = InferenceWorker(longest_wait_s=0.02), Eyes(largest_batch=64)
-    try:
+    eyes = Eyes(largest_batch=64)
+    with closing(InferenceWorker(longest_wait_s=0.02)) as worker:
         assert worker.encode(eyes, grey(7)).result(60).values[0] == 7
-        assert eyes.batches == [1]
-    finally:
-        worker.close()
+    assert eyes.batches == [1]
 
 
 def test_an_image_that_waits_for_company_is_encoded_when_the_worker_is_closed() -> None:

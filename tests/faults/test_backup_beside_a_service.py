@@ -7,10 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import NPZ, REMAP, Service, batch, begin, check_is_clean, command, small_disk
+from .conftest import (
+    ACTIVE,
+    Service,
+    batch,
+    begin,
+    check_is_clean,
+    command,
+    n_observations,
+    observation,
+    small_disk,
+)
 
 pytestmark = pytest.mark.slow
-DRIVE = "/v1/admin/domains/yard/traverses/drive"
 
 
 @dataclass
@@ -25,26 +34,22 @@ class Progress:
 def robot(service: Service, progress: Progress, stop: threading.Event) -> None:
     session_id = begin(service, 1)
     progress.views[session_id] = 1
-    while not stop.is_set():
-        view = progress.views[session_id]
-        progress.views[session_id] = service.answer_to("POST", **service.observe(session_id, view))["n_observations"]
-        stop.wait(0.02)  # or no job gets anywhere
+    while not stop.wait(0.02):  # or no job gets anywhere
+        request = observation(session_id, progress.views[session_id])
+        progress.views[session_id] = service.answer_to(**request)["n_observations"]
 
 
 def uploader(service: Service, progress: Progress, stop: threading.Event) -> None:
-    while not stop.is_set():
-        progress.n_frames = service.answer_to(
-            "POST", f"{DRIVE}/frames", content=batch(progress.n_frames, 5), headers=NPZ
-        )["n_frames"]
-        stop.wait(0.02)
+    while not stop.wait(0.02):
+        progress.n_frames = service.answer_to(**batch(progress.n_frames, 5))["n_frames"]
 
 
 def mapper(service: Service, progress: Progress, stop: threading.Event) -> None:
     while not stop.is_set():
-        job = service.ended_job(service.answer_to("POST", "/v1/admin/domains/yard/remaps", json=REMAP)["job_id"])
+        job = service.ended_job()
         assert job["state"] == "succeeded", job
         progress.version = job["result"]["map_version"]
-        service.answer_to("PUT", "/v1/admin/domains/loop/active-map", json={"version": 1 + progress.version % 2})
+        service.answer_to("PUT", ACTIVE, json={"version": 1 + progress.version % 2})
 
 
 def test_everything_acknowledged_before_it_began_comes_back(data_dir: Path, tmp_path: Path) -> None:
@@ -79,8 +84,10 @@ def test_everything_acknowledged_before_it_began_comes_back(data_dir: Path, tmp_
     check_is_clean(restored_dir)  # the map that was being made
     with Service(restored_dir) as service:
         for session_id, n_views in progress_before.views.items():
-            assert service.answer_to("GET", f"/v1/sessions/{session_id}")["n_observations"] >= n_views
-        assert service.answer_to("GET", DRIVE)["n_frames"] >= progress_before.n_frames
+            assert n_observations(service, session_id) >= n_views
+        assert (
+            service.answer_to("GET", "/v1/admin/domains/yard/traverses/drive")["n_frames"] >= progress_before.n_frames
+        )
         assert service.answer_to("GET", "/v1/domains/yard")["map_version"] >= progress_before.version
     check_is_clean(restored_dir)
 
