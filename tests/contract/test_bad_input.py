@@ -279,7 +279,7 @@ def test_whatever_is_asked_of_a_domain_session_or_job_that_nobody_knows(client):
         ("POST", REMAPS, 404, "unknown_traverse", ({"training_traverse": "none"}, {**REMAP, "check_traverse": "none"})),
         ("GET", "/v1/admin/jobs?domain=nowhere", 404, "unknown_domain", NO_BODY),
         ("GET", "/v1/admin/sessions?domain=nowhere", 404, "unknown_domain", NO_BODY),
-        ("GET", "/v1/sessions/none/events?after=-1", 422, "invalid_request", NO_BODY),
+        ("GET", "/v1/sessions/none/events", 404, "unknown_session", NO_BODY),
         ("GET", f"{ADMIN}/traverses/none", 404, "unknown_traverse", NO_BODY),
         ("DELETE", f"{ADMIN}/traverses/none", 404, "unknown_traverse", NO_BODY),
         ("PUT", f"{ADMIN}/traverses/none/frames/0?position_m=1", 404, "unknown_traverse", ({"encoding": [1]},)),

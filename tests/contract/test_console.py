@@ -80,6 +80,7 @@ def test_a_sessions_events_are_what_its_observations_were_answered(client):
     assert [number for _, number, _ in later_rows] == ["3", "4", None]
     assert later_rows[0][2]["belief"] == rows[2][2]["belief"]
     assert [number for _, number, _ in events(client, path)] == ["4", None], "the last one, where nobody said from when"
+    problem(client.get(f"{path}/events?after=-1"), 422, "invalid_request")
 
 
 def test_what_a_robot_saw_is_not_held_for_a_domain_that_keeps_no_pictures(client):

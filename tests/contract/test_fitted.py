@@ -50,6 +50,12 @@ def make(client, domain, evaluator=SIAMESE):
         assert {answer.status_code for answer in drive(client, domain, name, season)} == {201}
 
 
+@pytest.fixture
+def _short_fit(monkeypatch):
+    """For tests of the way of a fit, not of what it learns."""
+    monkeypatch.setattr("deepsimbad.evaluators.siamese._EPOCHS", 8)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["siamese", "autoencoder"])
 def test_images_wait_are_fitted_and_deleted_and_the_map_answers_every_kind_of_view(client, tmp_path, kind):
@@ -87,6 +93,7 @@ def test_images_wait_are_fitted_and_deleted_and_the_map_answers_every_kind_of_vi
 
 @of_one_process
 @pytest.mark.slow
+@pytest.mark.usefixtures("_short_fit")
 def test_views_that_were_kept_serve_the_next_fit_and_without_any_it_says_so(client, monkeypatch):
     make(client, "kept")
     encoded_images = []
@@ -107,6 +114,7 @@ def test_views_that_were_kept_serve_the_next_fit_and_without_any_it_says_so(clie
     assert etags[0] == etags[1] != etags[2]
 
 
+@pytest.mark.usefixtures("_short_fit")
 def test_a_full_spool_refuses_the_frame_and_loses_nothing(tmp_path):
     size = len(encoded(street(0)[0], ".png"))
     with service(tmp_path, max_spool_bytes=int(12.5 * size)) as client:
@@ -126,6 +134,7 @@ def test_a_full_spool_refuses_the_frame_and_loses_nothing(tmp_path):
         assert drive(client, "small", "first", 0, 1)[0].status_code == 200, "a deleted traverse makes room"
 
 
+@pytest.mark.usefixtures("_short_fit")
 def test_a_fit_that_is_cancelled_or_cannot_be_leaves_the_spool(tmp_path, monkeypatch):
     monkeypatch.setattr("deepsimbad.jobs.progress._INTERVAL_S", 0.0)  # every share is told, however fast the fit is
     states = []
