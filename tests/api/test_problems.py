@@ -61,13 +61,9 @@ def test_hints_that_json_cannot_hold_still_travel():
             status="a hint cannot displace a member",
         )
     )
-    assert (problem["number"], problem["array"], problem["many"], problem["nested"]["id"]) == (
-        "nan",
-        2.5,
-        [1, "inf"],
-        3,
-    )
-    assert (problem["status"], problem["instance"], problem["request_id"]) == (422, "/v1/x%ff", "r1")
+    expected = {"number": "nan", "array": 2.5, "many": [1, "inf"], "status": 422, "instance": "/v1/x%ff"}
+    assert problem.items() >= {**expected, "request_id": "r1"}.items()
+    assert problem["nested"]["id"] == 3
 
 
 def test_what_may_be_tried_again_says_when():

@@ -32,9 +32,8 @@ def localize(client, view=RANKS, shortlist=10, of="ready"):
 
 def test_the_answer_has_every_member_of_the_contract(client):
     answer = localize(client)
-    assert set(answer) == {
-        *("map_version", "timings_ms", "belief", "retrieval", "next_best_view", "informative", "warnings")
-    }
+    members = ("map_version", "timings_ms", "belief", "retrieval", "next_best_view", "informative", "warnings")
+    assert set(answer) == set(members)
     assert (answer["map_version"], answer["informative"], answer["warnings"]) == (1, True, [])
     plan = answer["next_best_view"]
     assert set(plan) == {"planner", "action_m", "stop", "actions"}

@@ -154,39 +154,33 @@ def test_what_is_beyond_keeping(history: str, keep_maps: int, expected: list[int
 
 def test_the_one_that_served_last_is_the_newest_though_the_clock_was_set_back(mapped_catalog: Catalog) -> None:
     add_map(mapped_catalog)
-    with (
-        closing(sqlite3.connect(catalog_path(mapped_catalog.data_dir))) as db,
-        db,
-    ):  # as noted by a clock that ran ahead
+    with closing(sqlite3.connect(catalog_path(mapped_catalog.data_dir))) as db, db:  # as a clock ahead would note it
         db.execute("UPDATE map SET retired_at = '2999-01-01T00:00:00.000Z' WHERE version = 1")
     add_map(mapped_catalog)
-    assert [version.version for version in surplus_versions(mapped_catalog.kept_maps(), 1)] == [1], (
-        "version 2 served last"
-    )
+    surplus = surplus_versions(mapped_catalog.kept_maps(), 1)
+    assert [version.version for version in surplus] == [1], "version 2 served last"
 
 
-def test_one_domain_alone_can_be_pruned(mapped_catalog: Catalog) -> None:
-    add_domain(mapped_catalog, "e")
+def test_one_domain_alone_can_be_pruned(service: Service) -> None:
+    add_domain(service.catalog, "e")
     for domain in ("d", "e", "d", "e", "d", "e"):
-        add_map(mapped_catalog, domain)
-    with open_service(mapped_catalog) as service:
-        assert retention_of(service).prune("e") == 1
-        assert len(with_files(mapped_catalog)) == 4
-        assert retention_of(service).prune() == 2
+        add_map(service.catalog, domain)
+    assert retention_of(service).prune("e") == 1
+    assert len(with_files(service.catalog)) == 4
+    assert retention_of(service).prune() == 2
 
 
-def test_a_beginning_session_keeps_its_map_from_the_first_moment(mapped_catalog: Catalog) -> None:
+def test_a_beginning_session_keeps_its_map_from_the_first_moment(service: Service) -> None:
     """A session begins on the map that the service last saw serve, though another process has activated another."""
-    with open_service(mapped_catalog) as service:
-        mapped_domain = service.maps.active("d")
-        add_map(mapped_catalog)
-        with service.maps.beginning(mapped_domain.snapshot), pytest.raises(MapInUseError):
-            retention_of(service).remove("d", 1)
-        retention_of(service).remove("d", 1)
-        with pytest.raises(UnavailableError, match="try again"):
-            asyncio.run(service.sessions.begin(mapped_domain, SessionConfig()))
-        assert service.store.pins() == set()
-        assert asyncio.run(service.sessions.begin(service.maps.refresh("d"), SessionConfig())).snapshot.version == 2
+    mapped_domain, retention = service.maps.active("d"), retention_of(service)
+    add_map(service.catalog)
+    with service.maps.beginning(mapped_domain.snapshot), pytest.raises(MapInUseError):
+        retention.remove("d", 1)
+    retention.remove("d", 1)
+    with pytest.raises(UnavailableError, match="try again"):
+        asyncio.run(service.sessions.begin(mapped_domain, SessionConfig()))
+    assert service.store.pins() == set()
+    assert asyncio.run(service.sessions.begin(service.maps.refresh("d"), SessionConfig())).snapshot.version == 2
 
 
 def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Catalog) -> None:
@@ -195,10 +189,9 @@ def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Cata
         retention, is_over = retention_of(service), threading.Event()
 
         def switching() -> None:
+            versions = [1, *(add_map(mapped_catalog, activate=False) for _ in range(12))]
             try:
-                for old_version, new_version in pairwise(
-                    [1, *(add_map(mapped_catalog, activate=False) for _ in range(12))]
-                ):
+                for old_version, new_version in pairwise(versions):
                     mapped_catalog.activate("d", new_version, old_version)
                     with suppress(MapInUseError):
                         retention.remove("d", old_version)  # at once, which `prune` never does
@@ -225,36 +218,35 @@ def test_sessions_begun_while_maps_are_switched_and_removed(mapped_catalog: Cata
 
 
 def test_a_crash_between_the_mark_and_the_file_is_finished_at_the_next_start(
-    mapped_catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+    service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add_map(mapped_catalog)
+    catalog = service.catalog
+    add_map(catalog)
 
     def dies(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with open_service(mapped_catalog) as service:
-        with monkeypatch.context() as patched:
-            patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
-            with pytest.raises(KeyboardInterrupt):
-                retention_of(service).remove("d", 1)
-        assert mapped_catalog.map("d", 1).removed_at is not None
-        assert mapped_catalog.map_path("d", 1).is_file()
-        with pytest.raises(RetiredMapError):
-            mapped_catalog.activate("d", 1, ANY)
-    assert mapped_catalog.discard_unfinished() == ["removed the file of the removed map 1 of domain d"]
-    assert with_files(mapped_catalog) == [2]
+    with monkeypatch.context() as patched:
+        patched.setattr("deepsimbad.store.catalog_maps.remove_database", dies)
+        with pytest.raises(KeyboardInterrupt):
+            retention_of(service).remove("d", 1)
+    assert catalog.map("d", 1).removed_at is not None
+    assert catalog.map_path("d", 1).is_file()
+    with pytest.raises(RetiredMapError):
+        catalog.activate("d", 1, ANY)
+    assert catalog.discard_unfinished() == ["removed the file of the removed map 1 of domain d"]
+    assert with_files(catalog) == [2]
 
 
 def test_where_sessions_cannot_be_read_nothing_is_removed_and_nobody_stopped(
-    mapped_catalog: Catalog, caplog: pytest.LogCaptureFixture
+    service: Service, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(2):
-        add_map(mapped_catalog)
-    with open_service(mapped_catalog) as service:
-        service.store.close()
-        assert retention_of(service).prune() == 0
-        assert "old maps could not be looked for" in caplog.text
-    assert with_files(mapped_catalog) == [1, 2, 3]
+        add_map(service.catalog)
+    service.store.close()
+    assert retention_of(service).prune() == 0
+    assert "old maps could not be looked for" in caplog.text
+    assert with_files(service.catalog) == [1, 2, 3]
 
 
 # How many are in memory

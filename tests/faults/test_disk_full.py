@@ -102,11 +102,8 @@ def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, F
                 assert refusal["reason"] in FULL, refusal
             # Whoever only asks is answered all the same.
             version = 2 if switch_answer.is_error else 1
-            assert (n_observations(service, session_id), n_frames(service), service.version_by("loop")) == (
-                3,
-                80,
-                version,
-            )
+            answers = n_observations(service, session_id), n_frames(service), service.version_by("loop")
+            assert answers == (3, 80, version)
         assert service.answer_to(**observation(session_id, 3))["n_observations"] == 4
         assert service.answer_to(**batch(80, 20))["n_frames"] == 100
         assert service.ended_job()["state"] == "succeeded"
@@ -115,8 +112,8 @@ def test_the_service_names_it_and_goes_on_when_there_is_room(disk: tuple[Path, F
     with Service(data_dir) as service:
         if not session_answer.is_error:
             assert service.answer_to("GET", f"/v1/sessions/{session_answer.json()['session_id']}")["map_version"] == 2
-        held = n_observations(service, session_id), n_frames(service), service.version_by("loop")
-        assert held == (4, 100, version)
+        answers = n_observations(service, session_id), n_frames(service), service.version_by("loop")
+        assert answers == (4, 100, version)
     check_is_clean(data_dir)
 
 
