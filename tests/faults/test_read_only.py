@@ -55,31 +55,47 @@ def read_only(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
         path.chmod(0o755)
 
 
-def test_the_service_does_not_start(read_only: Path) -> None:
-    new_dir = ("--create", "--data-dir", read_only / "new")
-    old_dir_run, new_dir_run = unprivileged(
-        *(("serve", "--port", 0, *options) for options in (("--data-dir", read_only), new_dir))
-    )
-    assert (old_dir_run.code, old_dir_run.out, new_dir_run.code, new_dir_run.out) == (1, "", 1, "")
-    assert old_dir_run.err.splitlines()[-1] == f"deepsimbad: unavailable: {read_only.name}: it may not be written"
-    assert new_dir_run.err.splitlines()[-1] == "deepsimbad: unavailable: new: it may not be written"
+@pytest.fixture(scope="module")
+def backup(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a backup may be written."""
+    return tmp_path_factory.mktemp("backup") / "b.tar"
 
 
-def test_who_would_write_is_told_in_one_line(read_only: Path) -> None:
-    """The commands would change the data directory, or write a backup or an export into it."""
-    changes = (("delete-domain", "loop", "--yes"), ("keys", "create", "--scope", "admin"))
-    exports = (("backup", read_only / "b.tar"), ("export", "loop", read_only / "m.map"))
-    for ran in unprivileged(*((*words, "--data-dir", read_only) for words in changes + exports)):
-        assert "may not be written" in ran.line or "cannot be opened" in ran.line
-    assert not [*read_only.glob("*b.tar*"), *read_only.glob("*m.map*")]
+@pytest.fixture(scope="module")
+def runs(read_only: Path, backup: Path) -> Iterator[dict[str, CommandResult]]:
+    """What each command did, all in one process; none changes anything."""
+    here = ("--data-dir", read_only)
+    commands = {
+        "info": ("info", "loop", *here),
+        "check": ("check", *here),
+        "backup": ("backup", backup, *here),
+        "delete-domain": ("delete-domain", "loop", "--yes", *here),
+        "keys": ("keys", "create", "--scope", "admin", *here),
+        "backup into it": ("backup", read_only / "b.tar", *here),
+        "export into it": ("export", "loop", read_only / "m.map", *here),
+        "serve": ("serve", "--port", 0, *here),
+        "serve a new one": ("serve", "--port", 0, "--create", "--data-dir", read_only / "new"),
+    }
+    times_ns = {path: path.stat().st_mtime_ns for path in (read_only, *read_only.rglob("*"))}
+    yield dict(zip(commands, unprivileged(*commands.values()), strict=True))
+    assert {path: path.stat().st_mtime_ns for path in (read_only, *read_only.rglob("*"))} == times_ns
 
 
-def test_who_asks_is_answered_and_it_can_be_checked_and_backed_up(read_only: Path, tmp_path: Path) -> None:
-    times_ns = {path: path.stat().st_mtime_ns for path in read_only.rglob("*")}
-    commands = (("info", "loop"), ("check",), ("backup", tmp_path / "b.tar"))
-    info, *other_runs = unprivileged(*((*words, "--data-dir", read_only) for words in commands))
-    assert info.code == 0
-    assert [(ran.code, ran.out) for ran in other_runs] == [(0, "")] * 2, other_runs
-    assert {path: path.stat().st_mtime_ns for path in read_only.rglob("*")} == times_ns
-    assert command("restore", tmp_path / "b.tar", "--data-dir", tmp_path / "there").code == 0
-    assert command("check", "--data-dir", tmp_path / "there").code == 0
+@pytest.mark.parametrize(("name", "folder"), [("serve", "data"), ("serve a new one", "new")])
+def test_the_service_does_not_start(runs: dict[str, CommandResult], name: str, folder: str) -> None:
+    assert (runs[name].code, runs[name].out) == (1, "")
+    assert runs[name].err.splitlines()[-1] == f"deepsimbad: unavailable: {folder}: it may not be written"
+
+
+@pytest.mark.parametrize("name", ["delete-domain", "keys", "backup into it", "export into it"])
+def test_who_would_write_is_told_in_one_line(runs: dict[str, CommandResult], name: str) -> None:
+    assert "may not be written" in runs[name].line or "cannot be opened" in runs[name].line
+
+
+def test_who_asks_is_answered_and_it_can_be_checked_and_backed_up(
+    runs: dict[str, CommandResult], backup: Path, tmp_path: Path
+) -> None:
+    assert runs["info"].code == 0
+    assert [(runs[name].code, runs[name].out) for name in ("check", "backup")] == [(0, "")] * 2, runs
+    assert command("restore", backup, "--data-dir", tmp_path).code == 0
+    assert command("check", "--data-dir", tmp_path).code == 0
