@@ -146,8 +146,8 @@ def check_is_clean(data_dir: Path) -> None:
 @contextmanager
 def small_disk(n_bytes: int, content: Path | None = None) -> Iterator[Path]:
     """A copy of a folder on a file system of its own of `n_bytes`; skips the test where none may be mounted."""
-    with tempfile.TemporaryDirectory() as beside:
-        (folder := Path(beside) / "disk").mkdir()
+    with tempfile.TemporaryDirectory() as parent:
+        (folder := Path(parent) / "disk").mkdir()
         mount = ["mount", "-t", "tmpfs", "-o", f"size={n_bytes}", "tmpfs", str(folder)]
         if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
             pytest.skip("no file system can be mounted here: it takes the rights of root")

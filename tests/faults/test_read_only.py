@@ -64,16 +64,16 @@ def backup(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def runs(read_only: Path, backup: Path) -> Iterator[dict[str, CommandResult]]:
     """What each command did, all in one process; none changes anything."""
-    here = ("--data-dir", read_only)
+    options = ("--data-dir", read_only)
     commands = {
-        "info": ("info", "loop", *here),
-        "check": ("check", *here),
-        "backup": ("backup", backup, *here),
-        "delete-domain": ("delete-domain", "loop", "--yes", *here),
-        "keys": ("keys", "create", "--scope", "admin", *here),
-        "backup into it": ("backup", read_only / "b.tar", *here),
-        "export into it": ("export", "loop", read_only / "m.map", *here),
-        "serve": ("serve", "--port", 0, *here),
+        "info": ("info", "loop", *options),
+        "check": ("check", *options),
+        "backup": ("backup", backup, *options),
+        "delete-domain": ("delete-domain", "loop", "--yes", *options),
+        "keys": ("keys", "create", "--scope", "admin", *options),
+        "backup into it": ("backup", read_only / "b.tar", *options),
+        "export into it": ("export", "loop", read_only / "m.map", *options),
+        "serve": ("serve", "--port", 0, *options),
         "serve a new one": ("serve", "--port", 0, "--create", "--data-dir", read_only / "new"),
     }
     times_ns = {path: path.stat().st_mtime_ns for path in (read_only, *read_only.rglob("*"))}
