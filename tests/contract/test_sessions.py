@@ -3,6 +3,7 @@
 import asyncio
 import io
 import math
+import time
 from datetime import UTC, datetime
 
 import httpx2
@@ -324,7 +325,7 @@ def test_a_start_repeated_at_once_is_one_session_and_views_at_once_are_all_answe
 
 
 def test_limits_expiry_and_metrics(tmp_path):
-    with service(tmp_path, max_sessions=2, session_ttl_s=0.6, session_sweep_s=0.05) as client:
+    with service(tmp_path, max_sessions=2, session_sweep_s=0.05) as client:
         client.make_ready_domain("ready")
         first = client.session()
         client.begin()
@@ -339,6 +340,7 @@ def test_limits_expiry_and_metrics(tmp_path):
         for outcome in ("accepted", "repeated", "invalid_move"):
             assert f'deepsimbad_observations_total{{outcome="{outcome}"}} 1.0' in text
         assert "deepsimbad_session_commit_writes_count" in text
+        client.services.sessions._clock = lambda: time.time() + 4000
         wait_until(lambda: "deepsimbad_sessions 0.0" in client.get("/metrics").text)
         assert problem(client.get(first), 410, "ended_session")["ending"] == "expired"
         client.begin()
