@@ -28,8 +28,7 @@ def test_two_data_directories_share_their_maps(deepsimbad, mapped_dir, tmp_path)
     assert "SHA-256 differs" in checked.out
     assert deepsimbad("check", *THERE).code == 0, "the files here are whole"
     assert deepsimbad("delete-domain", "route", "--yes", *THERE).code == 0
-    failure = deepsimbad("info", "route")
-    assert (failure.code, failure.err.split(": ")[1]) == (1, "unknown_domain")
+    assert "unknown_domain" in deepsimbad("info", "route").line
 
 
 def test_what_cannot_be_is_one_line(deepsimbad, mapped_dir, tmp_path, monkeypatch):
@@ -37,9 +36,7 @@ def test_what_cannot_be_is_one_line(deepsimbad, mapped_dir, tmp_path, monkeypatc
         (("init", "--map-store", "nowhere"), "invalid_settings"),
         (("check", "--objects"), "follows no map store"),
     ):
-        ran = deepsimbad(*arguments)
-        assert (ran.code, len(ran.err.splitlines())) == (1, 1), ran
-        assert word in ran.err
+        assert word in deepsimbad(*arguments).line
     monkeypatch.setenv("DEEPSIMBAD_MAP_STORE", f"file://{tmp_path}/store")
     assert deepsimbad("info", "route").code == 0
     (tmp_path / "store").rename(tmp_path / "lost")

@@ -1,6 +1,7 @@
 """`deepsimbad settings`, and what every command has in common: data directory, settings, help (design section 7)."""
 
 import json
+import re
 from collections.abc import Iterator
 
 import click
@@ -22,8 +23,7 @@ def commands(group: click.Group, *group_names: str) -> Iterator[tuple[str, ...]]
 def test_every_command_takes_a_data_directory(deepsimbad, words):
     ran = deepsimbad(*words, "--data-dir", "some", "--help")
     assert (ran.code, ran.err) == (0, "")
-    assert ran.out.startswith("Usage: ")
-    assert "--data-dir" in ran.out
+    assert re.match("Usage: .*--data-dir", ran.out, re.DOTALL)
 
 
 def test_every_setting_is_told_with_its_origin(deepsimbad, tmp_path, monkeypatch):
@@ -37,18 +37,13 @@ def test_every_setting_is_told_with_its_origin(deepsimbad, tmp_path, monkeypatch
     assert document["file"] == "deepsimbad.toml"
     settings = {name: (setting["value"], setting["origin"]) for name, setting in document["settings"].items()}
     assert set(settings) == set(Settings.model_fields)
-    assert settings["port"] == (9, "flag")
-    assert settings["data_dir"] == ("here", "flag")
-    assert settings["max_queue"] == (5, "environment")
-    assert settings["keep_maps"] == (7, "file")
-    assert settings["cors_origins"] == (["https://a", "https://b"], "file")
-    assert settings["tls_key"] == (None, "default")
+    expected = {"port": (9, "flag"), "data_dir": ("here", "flag"), "max_queue": (5, "environment")}
+    expected |= {"keep_maps": (7, "file"), "cors_origins": (["https://a", "https://b"], "file")}
+    assert {**settings, **expected, "tls_key": (None, "default")} == settings
     assert document["settings"]["max_queue"]["variable"] == "DEEPSIMBAD_MAX_QUEUE"
     (tmp_path / "deepsimbad.toml").unlink()
     ran = deepsimbad("settings")
-    assert (ran.code, ran.err) == (0, remark)
-    assert "none" in ran.out
-    assert "[]" in ran.out
+    assert (ran.code, ran.err, "none" in ran.out, "[]" in ran.out) == (0, remark, True, True)
 
 
 @pytest.mark.parametrize("command", [("settings",), ("info", "route"), ("localize", "route", "view.jpg")])
@@ -63,6 +58,4 @@ def test_every_command_that_takes_settings_heeds_the_file(deepsimbad, tmp_path, 
 
 def test_the_data_directory_may_come_from_the_file(deepsimbad, tmp_path):
     (tmp_path / "deepsimbad.toml").write_text("data_dir = 'there'")
-    ran = deepsimbad("info", "route")
-    assert ran.code == 1
-    assert "there are no domains in there" in ran.err
+    assert "there are no domains in there" in deepsimbad("info", "route").line
