@@ -25,7 +25,7 @@ def _cv2_file(extension: str, parameters: list[int]) -> bytes:
     return bytes(body)
 
 
-def _pillow_file(image: Pillow.Image, form: str, **options: object) -> bytes:
+def saved(image: Pillow.Image, form: str, **options: object) -> bytes:
     stream = io.BytesIO()
     image.save(stream, form, **options)
     return stream.getvalue()
@@ -40,9 +40,7 @@ FILES = {
     "jpeg tiff": _cv2_file(".tiff", [cv2.IMWRITE_TIFF_COMPRESSION, 7, cv2.IMWRITE_TIFF_ROWSPERSTRIP, 8]),
     "webp": _cv2_file(".webp", [cv2.IMWRITE_WEBP_QUALITY, 90]),
     "lossless webp": _cv2_file(".webp", [cv2.IMWRITE_WEBP_QUALITY, 101]),
-    "extended webp": _pillow_file(
-        Pillow.fromarray(picture()[..., ::-1]), "WEBP", exif=Pillow.Exif(), icc_profile=b"x" * 20
-    ),
+    "extended webp": saved(Pillow.fromarray(picture()[..., ::-1]), "WEBP", exif=Pillow.Exif(), icc_profile=b"x" * 20),
 }
 
 

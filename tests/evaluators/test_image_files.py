@@ -1,6 +1,5 @@
 """One reader: the decoder's own pixels of every kind of file, and a name for each that lacks a part of its picture."""
 
-import io
 import struct
 
 import cv2
@@ -13,6 +12,8 @@ from deepsimbad.errors import InvalidImageError, TruncatedImageError
 from deepsimbad.evaluators.image import decode_image
 from deepsimbad.evaluators.image_files import MEDIA_TYPES, ImageFile
 from deepsimbad_client.http import media_type_of
+
+from .conftest import saved
 
 LIMIT = 1_000_000
 SIZE = (160, 120)
@@ -27,12 +28,6 @@ def photo(channels: int = 3) -> np.ndarray:
     return pixels
 
 
-def saved(image: Pillow.Image, form: str, **options: object) -> bytes:
-    stream = io.BytesIO()
-    image.save(stream, form, **options)
-    return stream.getvalue()
-
-
 def turned(orientation: int) -> Pillow.Exif:
     exif = Pillow.Exif()
     exif[0x112] = orientation
@@ -40,6 +35,9 @@ def turned(orientation: int) -> Pillow.Exif:
 
 
 RGB = Pillow.fromarray(photo()[..., ::-1])
+CLEAR = RGB.convert("RGBA")
+CLEAR.putalpha(128)
+DEEP = Pillow.fromarray(np.tile(np.linspace(0, 0xFFFF, 48).astype(np.uint16), (32, 1)))
 JPEGS = {
     "4:2:0": saved(RGB, "JPEG"),
     "4:4:4": saved(RGB, "JPEG", subsampling=0, quality=95),
@@ -53,21 +51,36 @@ OTHERS = {
     "palette": saved(RGB.convert("P"), "PNG"),
     "clear palette": saved(RGB.convert("P"), "PNG", transparency=3),
     "grey and alpha": saved(RGB.convert("LA"), "PNG"),
-    "PNG on its side": saved(RGB, "PNG", exif=turned(8)),
     "CMYK TIFF": saved(RGB.convert("CMYK"), "TIFF"),
+    **{f"grey {form}": saved(RGB.convert("L"), form) for form in ("PNG", "TIFF", "WEBP")},
+    **{f"bilevel {form}": saved(RGB.convert("1"), form) for form in ("PNG", "TIFF")},
+    **{f"clear {form}": saved(CLEAR, form, lossless=True) for form in ("PNG", "WEBP")},
+    **{f"{form} of sixteen bits": saved(DEEP, form) for form in ("PNG", "TIFF")},
+    **{f"{form} on its side": saved(RGB, form, exif=turned(6), lossless=True) for form in ("PNG", "TIFF", "WEBP")},
     "pages": saved(RGB, "TIFF", save_all=True, append_images=[RGB.rotate(90)]),
     "BigTIFF": saved(RGB, "TIFF", big_tiff=True),
     "grey BigTIFF": saved(RGB.convert("L"), "TIFF", big_tiff=True, compression="tiff_lzw"),
     "animation": saved(RGB, "WEBP", save_all=True, append_images=[RGB.rotate(90)], lossless=True),
+}
+DECODED = {
+    **{f"grey {form}": np.asarray(RGB.convert("L"))[..., np.newaxis].repeat(3, axis=2) for form in ("PNG", "TIFF")},
+    **{f"clear {form}": photo() for form in ("PNG", "WEBP")},
+    **{
+        f"{form} of sixteen bits": (np.asarray(DEEP) >> 8)[..., np.newaxis].repeat(3, axis=2)
+        for form in ("PNG", "TIFF")
+    },
+    **{f"{form} on its side": cv2.rotate(photo(), cv2.ROTATE_90_CLOCKWISE) for form in ("PNG", "TIFF", "WEBP")},
 }
 FILM = b"\0\0\0\x18ftypmp42" + np.random.default_rng(0).bytes(5000) + b"\xff\xda\xff\xd9\xff\xd8"
 
 
 @pytest.mark.parametrize("kind", [*JPEGS, *OTHERS])
 def test_the_pixels_are_opencvs(kind):
+    """Three channels of 8 bits without alpha, the upper 8 of 16, turned as the file says."""
     body = (JPEGS | OTHERS)[kind]
     expected = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR_BGR)
     np.testing.assert_array_equal(decode_image(body, LIMIT), expected)
+    np.testing.assert_array_equal(expected, DECODED.get(kind, expected))
     assert media_type_of(body) == ImageFile.read(body, LIMIT).media_type
 
 

@@ -21,29 +21,22 @@ from deepsimbad.evaluators.weights.lock import FileRecord, Lock, tree_sha256
 from .references import FULL, random_network, write_matlab
 
 
-def test_every_row_can_be_named_in_a_configuration():
+def test_every_row_can_be_named_in_a_configuration_and_says_what_can_be_known_of_it():
     names = [weights.name for weights in KNOWN] + [canonical(weights.extractor) for weights in KNOWN]
     assert len(set(names)) == len(names)
     for weights in KNOWN:
         assert re.fullmatch(EXTRACTOR_PATTERN, weights.extractor), weights.name
         assert known_weights(weights.name) is known_weights(weights.extractor) is weights
-    assert known_weights("torchhub:GMBERTON/megaloc:get_trained_model") is known_weights("megaloc")
-    assert known_weights("torchhub:gmberton/MegaLoc:Get_trained_model") is None
-    assert known_weights("nothing") is None
-
-
-def test_every_row_says_what_can_be_known_of_it():
-    for weights in KNOWN:
         assert weights.page is None or weights.page.startswith("https://")
         assert weights.url is None or (weights.url.startswith("https://") and weights.file)
         assert weights.sha256 is None or re.fullmatch("[0-9a-f]{8,64}", weights.sha256)
-        assert (weights.commit is None) or (
-            weights.extractor.startswith(HUB) and re.fullmatch("[0-9a-f]{40}", weights.commit)
-        )
         assert weights.url or weights.page or weights.package, f"{weights.name}: nobody learns where it is"
-        if weights.extractor.startswith(HUB):
-            assert weights.encoding_dim
-            assert weights.input_size
+        is_hub = weights.extractor.startswith(HUB)
+        assert weights.commit is None or (is_hub and re.fullmatch("[0-9a-f]{40}", weights.commit))
+        assert not is_hub or (weights.encoding_dim and weights.input_size)
+    assert known_weights("torchhub:GMBERTON/megaloc:get_trained_model") is known_weights("megaloc")
+    for unknown in ("torchhub:gmberton/MegaLoc:Get_trained_model", "nothing"):
+        assert known_weights(unknown) is None
 
 
 def test_what_is_stated_of_our_own_extractors_is_so():
@@ -124,20 +117,20 @@ def test_a_file_that_lies_here_is_recorded_once_it_can_be_loaded(tmp_path):
     assert _pull(path, file_sha256(path)).n_bytes == 7, "who states the digest vouches for the file"
 
 
-def test_a_known_file_must_have_the_digest_that_is_known_of_it(tmp_path):
+def test_a_known_file_must_have_the_digest_that_is_known_of_it_and_one_at_no_address_is_put_there_by_hand(tmp_path):
     weights = known_weights("squeezenet")
     (tmp_path / weights.file).write_bytes(b"another")
-    with pytest.raises(InvalidWeightsError, match="should have b66bff10"):
-        pull_file(tmp_path, weights.extractor, lambda *_: None)
-
-
-def test_a_file_at_no_address_is_to_be_put_there_by_hand(tmp_path):
-    with pytest.raises(MissingWeightsError) as error:
-        pull_file(tmp_path, "netvlad:checkpoint.pth.tar", lambda *_: None)
-    assert "https://drive.google.com" in error.value.message
-    assert str(tmp_path / "checkpoint.pth.tar") in error.value.message
-    with pytest.raises(MissingWeightsError, match="--url"):
-        pull_file(tmp_path, "onnx:mine.onnx", lambda *_: None)
+    for extractor, error, says in (
+        (weights.extractor, InvalidWeightsError, "should have b66bff10"),
+        (
+            "netvlad:checkpoint.pth.tar",
+            MissingWeightsError,
+            rf"(?s)drive\.google\.com.*{tmp_path}/checkpoint\.pth\.tar",
+        ),
+        ("onnx:mine.onnx", MissingWeightsError, "--url"),
+    ):
+        with pytest.raises(error, match=says):
+            pull_file(tmp_path, extractor, lambda *_: None)
 
 
 def _zip(path, members):
@@ -169,22 +162,16 @@ def test_archives_that_are_no_repositories_are_refused(tmp_path, monkeypatch, me
     assert not (tmp_path / "out.py").exists()
 
 
-def test_links_in_an_archive_are_refused(tmp_path):
+def test_links_in_an_archive_and_torn_ones_are_refused(tmp_path):
     link = zipfile.ZipInfo("r/link")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
-    with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
-        archive.writestr("r/hubconf.py", "")
-        archive.writestr(link, "/etc/passwd")
+    path = _zip(tmp_path / "x.zip", {"r/hubconf.py": "", link: "/etc/passwd"})
     with pytest.raises(InvalidWeightsError, match="outside"):
-        unpack(tmp_path / "x.zip", tmp_path / "to")
-
-
-@pytest.mark.parametrize("n_bytes", [0, 10, 80])
-def test_a_torn_archive_is_refused(tmp_path, n_bytes):
-    path = _zip(tmp_path / "x.zip", {"r/hubconf.py": "import torch"})
-    path.write_bytes(path.read_bytes()[:n_bytes])
-    with pytest.raises(InvalidWeightsError, match="no whole archive"):
         unpack(path, tmp_path / "to")
+    for n_bytes in (80, 10, 0):
+        path.write_bytes(path.read_bytes()[:n_bytes])
+        with pytest.raises(InvalidWeightsError, match="no whole archive"):
+            unpack(path, tmp_path / "to")
 
 
 def test_an_unpacked_repository_replaces_what_was_there(tmp_path):

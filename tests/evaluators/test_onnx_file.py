@@ -1,7 +1,6 @@
 """ONNX files of anybody's making, written here with onnx.helper."""
 
 import hashlib
-import json
 
 import numpy as np
 import onnx
@@ -12,7 +11,6 @@ from deepsimbad.errors import InvalidWeightsError, MissingPackageError, MissingW
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.extractors import onnx_file as module
 from deepsimbad.evaluators.extractors.onnx_file import onnx_file
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.evaluators.weights.lock import FileRecord, Lock
 
 D = 6
@@ -54,84 +52,69 @@ def by_hand(images, scale=1 / 255, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def test_a_file_encodes_as_its_graph_says(tmp_path):
-    extractor = load(tmp_path, model())
-    assert (extractor.input_size, extractor.encoding_dim, extractor.largest_batch) == ((30, 20), D, 1)
-    encodings = extractor.encode(images())
-    assert encodings.dtype == np.float32
-    np.testing.assert_allclose(encodings, by_hand(images()), atol=1e-3)
-    assert extractor.weights_sha256 == hashlib.sha256((tmp_path / "places.onnx").read_bytes()).hexdigest()
-
-
-def test_it_is_made_by_name(tmp_path):
-    load(tmp_path, model())
-    config = evaluator_config({"kind": "feature_l2", "extractor": "onnx:places.onnx"})
-    assert make_evaluator(config, Compute(weights_dir=tmp_path)).encode(images()).shape == (3, D)
-
-
 @pytest.mark.parametrize(
     ("shape", "size"),
     [
+        (("n", 3, 20, 30), (30, 20)),
         (("n", 3, "h", "w"), (224, 224)),
         ((None, 3, None, None), (224, 224)),
         (("n", 3, "h", 100), (100, 224)),
         ((1, 3, 20, 30), (30, 20)),
     ],
 )
-def test_sides_that_are_open_and_batches_that_are_not(tmp_path, shape, size):
+def test_a_file_encodes_as_its_graph_says_which_may_leave_sides_and_batches_open(tmp_path, shape, size):
+    assert load(tmp_path, model()).largest_batch == 1, "unless told"
     extractor = load(tmp_path, model(shape, output=(shape[0], D)), largest_batch=4)
-    assert extractor.input_size == size
-    assert extractor.largest_batch == (1 if shape[0] == 1 else 4)
+    largest_batch = 1 if shape[0] == 1 else 4
+    assert (extractor.input_size, extractor.encoding_dim, extractor.largest_batch) == (size, D, largest_batch)
     scenes = images(size=size[::-1])
-    np.testing.assert_allclose(extractor.encode(scenes), by_hand(scenes), atol=1e-3)
-
-
-def test_how_images_are_shown_is_told_by_the_file(tmp_path):
-    metadata = {"mean": "[0.5, 0.4, 0.3]", "std": "[1, 2, 3]", "scale": "0.01", "channels": "BGR"}
-    extractor = load(tmp_path, model(metadata=metadata))
-    expected = by_hand(images(), 0.01, (0.5, 0.4, 0.3), (1, 2, 3), bgr=True)
-    np.testing.assert_allclose(extractor.encode(images()), expected, atol=1e-3)
-    metadata = {"mean": "[123, 117, 104]", "std": "[1, 1, 1]", "scale": "[1, 1, 1]", "layout": "NHWC"}
-    extractor = load(tmp_path, model(("n", 20, 30, 3), metadata=metadata, axes=(1, 2)))
-    np.testing.assert_allclose(extractor.encode(images()), by_hand(images(), 1, (123, 117, 104), (1, 1, 1)), atol=1e-3)
-    extractor = load(tmp_path, model(metadata={"channels": "BGR"}))
-    expected = by_hand(images(), mean=(0.406, 0.456, 0.485), std=(0.225, 0.224, 0.229), bgr=True)
-    np.testing.assert_allclose(extractor.encode(images()), expected, atol=1e-3)
+    encodings = extractor.encode(scenes)
+    assert encodings.dtype == np.float32
+    np.testing.assert_allclose(encodings, by_hand(scenes), atol=1e-3)
+    assert extractor.weights_sha256 == hashlib.sha256((tmp_path / "places.onnx").read_bytes()).hexdigest()
 
 
 @pytest.mark.parametrize(
-    "metadata",
+    ("metadata", "parts"),
     [
-        {"means": "[1, 2, 3]"},
-        {"mean": "[1, 2]"},
-        {"mean": "[1, 2, NaN]"},
-        {"mean": "red"},
-        {"mean": "[1, 2, true]"},
-        {"mean": "[1, 2, 1e300]"},
-        {"std": "[1, 0, 1]"},
-        {"scale": "[]"},
-        {"scale": json.dumps([[1]])},
-        {"channels": "GBR"},
-        {"layout": "nchw"},
+        (
+            {"mean": "[0.5, 0.4, 0.3]", "std": "[1, 2, 3]", "scale": "0.01", "channels": "BGR"},
+            {"scale": 0.01, "mean": (0.5, 0.4, 0.3), "std": (1, 2, 3), "bgr": True},
+        ),
+        (
+            {"mean": "[123, 117, 104]", "std": "[1, 1, 1]", "scale": "[1, 1, 1]", "layout": "NHWC"},
+            {"scale": 1, "mean": (123, 117, 104), "std": (1, 1, 1)},
+        ),
+        ({"channels": "BGR"}, {"mean": (0.406, 0.456, 0.485), "std": (0.225, 0.224, 0.229), "bgr": True}),
     ],
     ids=str,
 )
-def test_metadata_that_means_nothing_is_refused(tmp_path, metadata):
-    with pytest.raises(InvalidWeightsError, match=f"deepsimbad.{next(iter(metadata))}"):
-        load(tmp_path, model(metadata=metadata))
+def test_how_images_are_shown_is_told_by_the_file(tmp_path, metadata, parts):
+    layout = {"shape": ("n", 20, 30, 3), "axes": (1, 2)} if "layout" in metadata else {}
+    extractor = load(tmp_path, model(**layout, metadata=metadata))
+    np.testing.assert_allclose(extractor.encode(images()), by_hand(images(), **parts), atol=1e-3)
 
 
-def test_maps_of_one_cell_are_encodings(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *(("mean", text) for text in ("[1, 2]", "[1, 2, NaN]", "red", "[1, 2, true]", "[1, 2, 1e300]")),
+        *(("means", "[1, 2, 3]"), ("std", "[1, 0, 1]"), ("scale", "[]"), ("scale", "[[1]]")),
+        *(("channels", "GBR"), ("layout", "nchw")),
+    ],
+)
+def test_metadata_that_means_nothing_is_refused(tmp_path, name, text):
+    with pytest.raises(InvalidWeightsError, match=f"deepsimbad.{name}"):
+        load(tmp_path, model(metadata={name: text}))
+
+
+MEANS = helper.make_node("ReduceMean", ["x"], ["means"], axes=[2, 3], keepdims=0)
+
+
+def test_maps_of_one_cell_are_encodings_and_where_nothing_is_seen_they_are_neutral(tmp_path):
     nodes = [helper.make_node("GlobalAveragePool", ["x"], ["y"])]
-    extractor = load(tmp_path, model(nodes=nodes, output=("n", 3, 1, 1)))
-    assert extractor.encode(images()).shape == (3, 3)
-
-
-def test_an_image_in_which_nothing_is_seen_has_a_neutral_encoding(tmp_path):
-    nodes = [
-        helper.make_node("ReduceMean", ["x"], ["means"], axes=[2, 3], keepdims=0),
-        helper.make_node("Sub", ["means", "means"], ["y"]),
-    ]
+    assert load(tmp_path, model(nodes=nodes, output=("n", 3, 1, 1))).encode(images()).shape == (3, 3)
+    nodes = [MEANS, helper.make_node("Sub", ["means", "means"], ["y"])]
     encodings = load(tmp_path, model(nodes=nodes, output=("n", 3))).encode(images())
     np.testing.assert_allclose(encodings, 3**-0.5, atol=1e-3)
 
@@ -153,6 +136,8 @@ def _node(name, *inputs, **attributes):
         (lambda: model(nodes=_node("Shape", "x"), output=(4,)), "."),
         (lambda: model(nodes=_node("MatMul", "x", "weights")), "."),
         (lambda: model(nodes=_node("Sight", "x", domain="others"), opsets=(("", 17), ("others", 1))), "can run"),
+        (lambda: model(nodes=[MEANS, helper.make_node("Sub", ["means", "means"], ["none"]),
+                              *_node("Div", "means", "none")], output=("n", 3)), "NaN, infinity"),
         (lambda: model().SerializeToString()[:-40], "."),
         (lambda: model().SerializeToString()[:50], "."),
         (lambda: b"", "no whole ONNX file"),
@@ -165,16 +150,6 @@ def test_what_gives_no_encodings_is_refused(tmp_path, capfd, make_file, message)
         load(tmp_path, make_file())
     assert "places.onnx" in refused.value.message
     assert capfd.readouterr() == ("", "")
-
-
-def test_numbers_that_are_none_are_refused(tmp_path):
-    nodes = [
-        helper.make_node("ReduceMean", ["x"], ["means"], axes=[2, 3], keepdims=0),
-        helper.make_node("Sub", ["means", "means"], ["none"]),
-        helper.make_node("Div", ["means", "none"], ["y"]),
-    ]
-    with pytest.raises(InvalidWeightsError, match="NaN, infinity"):
-        load(tmp_path, model(nodes=nodes, output=("n", 3)))
 
 
 @pytest.mark.parametrize("location", ["initializer", "constant", "branch"])

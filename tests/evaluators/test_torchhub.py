@@ -226,39 +226,37 @@ def test_a_module_that_the_repository_lacks_itself_is_no_package(tmp_path):
 
 
 def test_checkpoints_are_brought_by_a_pull_alone_and_recorded(tmp_path, monkeypatch):
-    requests = []
+    requests, url = [], "http://127.0.0.1:9/places.pth"
+    checkpoint = tmp_path / "hub" / "checkpoints" / "places.pth"
 
     def fetch(url, target, tell, sha256=None, advice=""):
         requests.append((url, sha256))
         target.parent.mkdir(exist_ok=True)
         torch.save({"project.weight": torch.ones(8, 12)}, target)
 
+    with pytest.raises(MissingWeightsError, match=rf"{url} cannot be reached.*{checkpoint}"):
+        pull(tmp_path, "checkpoint")
     monkeypatch.setattr(downloads, "fetch", fetch)
     record = pull(tmp_path, "checkpoint")
-    assert requests == [("http://127.0.0.1:9/places.pth", None)]
-    checkpoint = tmp_path / "hub" / "checkpoints" / "places.pth"
-    assert list(record.beside) == ["checkpoints/places.pth"]
+    assert (requests, list(record.beside)) == ([(url, None)], ["checkpoints/places.pth"])
+    sha256 = record.beside["checkpoints/places.pth"]
     np.testing.assert_allclose(np.abs(load(tmp_path, "checkpoint").encode(scenes())), 8**-0.5, rtol=1e-3)
     checkpoint.unlink()
     with pytest.raises(MissingWeightsError, match=r"places\.pth is missing"):
         load(tmp_path, "checkpoint")
     torch.save({"project.weight": torch.zeros(8, 12)}, checkpoint)
-    with pytest.raises(InvalidWeightsError, match=f"recorded with {record.beside['checkpoints/places.pth']}"):
-        load(tmp_path, "checkpoint")
-    with pytest.raises(InvalidWeightsError, match="remove it"):
-        pull(tmp_path, "checkpoint")
+    for call, message in ((load, f"recorded with {sha256}"), (pull, "remove it")):
+        with pytest.raises(InvalidWeightsError, match=message):
+            call(tmp_path, "checkpoint")
     checkpoint.unlink()
-    again = pull(tmp_path, "checkpoint")
-    assert again == record
-    assert requests[1:] == [("http://127.0.0.1:9/places.pth", record.beside["checkpoints/places.pth"])]
+    assert pull(tmp_path, "checkpoint") == record
+    assert requests[1:] == [(url, sha256)]
 
 
-def test_a_pull_without_a_network_says_what_to_put_where(tmp_path):
-    place = tmp_path / "hub" / "checkpoints" / "places.pth"
-    with pytest.raises(MissingWeightsError, match=r"127\.0\.0\.1:9/places\.pth cannot be reached") as error:
-        pull(tmp_path, "checkpoint")
-    assert str(place) in error.value.message
-    torch.save({"project.weight": torch.ones(8, 12)}, place)
+def test_a_checkpoint_that_was_put_there_needs_no_network(tmp_path):
+    checkpoints = tmp_path / "hub" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    torch.save({"project.weight": torch.ones(8, 12)}, checkpoints / "places.pth")
     assert list(pull(tmp_path, "checkpoint").beside) == ["checkpoints/places.pth"]
 
 
@@ -302,24 +300,20 @@ def test_repositories_may_have_modules_of_one_name(tmp_path):
 @pytest.mark.parametrize("change", ["changed", "added", "removed", "gone"])
 def test_a_tree_that_was_changed_is_not_run(tmp_path, change):
     record = pull(tmp_path)
-    tree = tmp_path / "hub" / record.folder
-    mark = tmp_path / "was-run"
+    tree, mark = tmp_path / "hub" / record.folder, tmp_path / "was-run"
     evil = f"open({str(mark)!r}, 'w')\n"
-    if change == "changed":
-        (tree / "hubconf.py").write_text(evil + HUBCONF)
-    elif change == "added":
-        (tree / "torch.py").write_text(evil)
-    elif change == "removed":
-        (tree / "places_model.py").unlink()
-    else:
-        tree.rename(tmp_path / "elsewhere")
-    error_type = MissingWeightsError if change == "gone" else InvalidWeightsError
-    with pytest.raises(error_type) as error:
+    changes = {
+        "changed": lambda: (tree / "hubconf.py").write_text(evil + HUBCONF),
+        "added": lambda: (tree / "torch.py").write_text(evil),
+        "removed": (tree / "places_model.py").unlink,
+        "gone": lambda: tree.rename(tmp_path / "elsewhere"),
+    }
+    changes[change]()
+    with pytest.raises(MissingWeightsError if change == "gone" else InvalidWeightsError) as error:
         load(tmp_path)
     assert not mark.exists()
     assert record.folder in error.value.message
-    if change != "gone":
-        assert record.tree_sha256 in error.value.message
+    assert change == "gone" or record.tree_sha256 in error.value.message
     assert pull(tmp_path) == record, "a pull mends it"
     assert load(tmp_path).encoding_dim == 8
 
@@ -335,12 +329,11 @@ def test_an_archive_of_the_same_commit_must_be_the_same(tmp_path):
     record = pull(tmp_path)
     (tmp_path / "hub" / record.folder / "hubconf.py").write_text("")
     mark = tmp_path / "was-run"
-    files = {"hubconf.py": f"open({str(mark)!r}, 'w')\n{HUBCONF}", "places_model.py": MODEL}
-    with pytest.raises(InvalidWeightsError, match=record.tree_sha256):
-        pull(tmp_path, files=files)
+    evil = {"hubconf.py": f"open({str(mark)!r}, 'w')\n{HUBCONF}", "places_model.py": MODEL}
+    for parts, message in (({"files": evil}, record.tree_sha256), ({"sha256": "00000000"}, "should have 00000000")):
+        with pytest.raises(InvalidWeightsError, match=message):
+            pull(tmp_path, **parts)
     assert not mark.exists()
-    with pytest.raises(InvalidWeightsError, match="should have 00000000"):
-        pull(tmp_path, sha256="00000000")
     assert pull(tmp_path) == record
 
 
