@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from deepsimbad.core.route import Route, same_places, true_images_of
 from deepsimbad.errors import InvalidRouteError
 
-SQUARE = {"x_m": np.array([0.0, 10, 10, 0]), "y_m": np.array([0.0, 0, 10, 10])}
+CORNERS = {"x_m": np.array([0.0, 10, 10, 0]), "y_m": np.array([0.0, 0, 10, 5])}
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,9 @@ SQUARE = {"x_m": np.array([0.0, 10, 10, 0]), "y_m": np.array([0.0, 0, 10, 10])}
     [
         pytest.param(Route(np.arange(5) * 2.0), 8, [2] * 5, id="even spacing"),
         pytest.param(Route(np.arange(5) * 2.0, closed=True), 10, [2] * 5, id="a loop"),
-        pytest.param(Route(np.arange(4) * 10.0, closed=True, **SQUARE), 40, [10] * 4, id="the gap is the plane's"),
+        pytest.param(
+            Route(np.arange(4) * 10.0, closed=True, **CORNERS), 35, [7.5, 10, 10, 7.5], id="the gap is the plane's"
+        ),
         pytest.param(Route(np.array([0.0, 1, 2, 2, 2, 2, 3, 4])), 4, [1, 1, 0.5, 0, 0, 0.5, 1, 1], id="a stop"),
         pytest.param(Route(np.full(3, 7.0)), 0, [1] * 3, id="no length"),
         pytest.param(Route(np.array([4.0])), 0, [1], id="one image"),
