@@ -199,7 +199,6 @@ def test_files_that_are_no_maps_are_damaged_maps(path: Path, tmp_path: Path) -> 
         "INSERT INTO _sqlite_migrations (migration_set, name) VALUES ('deepsimbad_map', 'm999_future')",
         "DELETE FROM map",
         "DELETE FROM posting",
-        "UPDATE posting SET landmark = 3, rank = 1",
         "UPDATE posting SET body = zeroblob(length(body))",
         "UPDATE map SET n_map_images = 1000000000000",
         "UPDATE map SET config = '{'",

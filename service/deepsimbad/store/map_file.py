@@ -12,7 +12,7 @@ from typing import Any
 from numpy.typing import NDArray
 from sqlite_utils import Database
 
-from deepsimbad.core.index.packing import pack_lists, unpack_lists, unpack_postings
+from deepsimbad.core.index.packing import pack_lists, unpack_lists
 from deepsimbad.core.map import Map
 from deepsimbad.errors import (
     ConflictError,
@@ -149,13 +149,8 @@ def _read(db: Database, path: Path) -> Map:
     row = rows[0]
     checksum = Checksum()
     checksum.add(*(row[column] for column in _DESCRIPTION))
-    blocks = [body for (body,) in db.execute("SELECT body FROM posting WHERE landmark IS NULL ORDER BY part")]
+    blocks = [body for (body,) in db.execute("SELECT body FROM posting ORDER BY part")]
     checksum.add(*blocks)
-    postings = db.execute(  # of an earlier release
-        "SELECT landmark, rank, body FROM posting WHERE landmark IS NOT NULL ORDER BY landmark, rank"
-    ).fetchall()
-    for posting in postings:
-        checksum.add(*posting)
     model = load_arrays(db, _MODEL_TABLE, checksum)
     arrays: dict[str, NDArray[Any]] = {}
     for table in _TABLES:
@@ -163,11 +158,8 @@ def _read(db: Database, path: Path) -> Map:
     if checksum.value != row["checksum"]:
         raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
     arrays |= {name: unpack_texts(arrays[name], row[_TEXTS[name]]) for name in _TEXTS.keys() & arrays.keys()}
-    shape = row["list_length"], row["n_map_images"]
-    if postings:
-        arrays["lists"] = unpack_postings(postings, *shape)
-    else:
-        arrays["lists"] = unpack_lists(blocks, *shape, row["n_landmarks"], model.get("prototypes"))
+    shape = row["list_length"], row["n_map_images"], row["n_landmarks"]
+    arrays["lists"] = unpack_lists(blocks, *shape, model.get("prototypes"))
     document = {name: from_json(row[name]) if name in _AS_JSON else row[name] for name in _DESCRIPTION}
     return Map.from_arrays(document, model, arrays, _bytes_by_table(db)["posting"])
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepsimbad.core.index import packing
-from deepsimbad.core.index.packing import pack_lists, unpack_lists, unpack_postings
+from deepsimbad.core.index.packing import pack_lists, unpack_lists
 
 RNG = np.random.default_rng(0)
 PROTOTYPES = RNG.normal(size=(60, 16)).astype(np.float32)
@@ -88,28 +88,3 @@ def test_arbitrary_bytes_never_crash(block, n_images):
     except ValueError:
         return
     assert lists.max() < 60
-
-
-# Posting lists, which earlier releases wrote: the first as runs, the others as gaps.
-POSTED = np.array([[0, 0, 0, 0, 1, 2, 1, 3, 0, 0, 0, 0], [1, 2, 3, 1, 0, 3, 2, 0, 1, 1, 1, 1]])
-POSTINGS = [
-    *((0, 1, b"@\xb1`"), (0, 2, b"\x01$"), (1, 1, b"\x01,"), (1, 2, b"\x00\x90\xf0")),
-    *((2, 1, b"\x010"), (2, 2, b"\x01\xc8"), (3, 1, b"\x02p"), (3, 2, b"\x00$")),
-]
-
-
-def test_posting_lists_of_earlier_releases_come_back():
-    lists = unpack_postings(POSTINGS, 2, 12)
-    np.testing.assert_array_equal(lists, POSTED)
-    with pytest.raises(ValueError, match="fill"):
-        unpack_postings(POSTINGS[:-1], 2, 12)
-    with pytest.raises(ValueError, match="damaged"):
-        unpack_postings([*POSTINGS, POSTINGS[0]], 2, 12)
-    with pytest.raises(ValueError, match="out of range"):
-        unpack_postings([(0, 3, POSTINGS[0][2])], 2, 12)
-
-
-@given(st.binary(min_size=1, max_size=40))
-def test_arbitrary_postings_never_crash(blob):
-    with pytest.raises(ValueError, match=r"fill|damaged"):
-        unpack_postings([(0, 1, blob), (0, 1, blob)], 1, 300)

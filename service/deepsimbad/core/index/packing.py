@@ -9,7 +9,7 @@ Every block of 8,192 images is a stream of its own, and counts go on from block 
 but the last. All arithmetic is of integers, or rounded as IEEE 754 says, so every machine reads the same.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -311,80 +311,3 @@ def _write_bit(coder: NDArray[np.int64], stream: NDArray[np.uint8], bit: int) ->
             stream[position >> 3] |= np.uint8(0x80 >> (position & 7))
         coder[_AT] += 1
     coder[_PENDING] = 0
-
-
-# The index as earlier releases wrote it, posting lists packed below the byte, which are still read.
-#
-# A posting list is the increasing ids of the map images that hold one landmark at one rank, written either as gaps or
-# as runs (gap, length). All numbers are Rice codes: the quotient in unary (zeros, then a one), then the low bits. The
-# zeros that pad the last byte can never end a quotient, so a list has no stored length.
-#
-# Blob: one header byte, then the bit stream, most significant bit first. The header's low five bits are the Rice
-# parameter of the gaps; its high three bits are 0 for plain gaps, else 1 + the Rice parameter of the run lengths.
-
-_EMPTY = np.uint16(0xFFFF)  # no landmark; ids are less (see Map)
-
-
-def unpack_postings(postings: Iterable[tuple[int, int, bytes]], list_length: int, n_images: int) -> NDArray[np.uint16]:
-    """[h, n] the landmark lists from posting lists, each (landmark from 0, rank from 1, blob).
-
-    Raises:
-        ValueError: A map image is listed twice at a rank, missing from one, or out of range.
-    """
-    lists = np.full((list_length, n_images), _EMPTY)
-    n_placed = 0
-    for landmark, rank, blob in postings:
-        if not 1 <= rank <= list_length or not 0 <= landmark < _EMPTY:
-            raise ValueError(f"posting of landmark {landmark} at rank {rank} is out of range")
-        n_more = int(_place(np.frombuffer(blob, np.uint8), lists[rank - 1], landmark, int(_EMPTY))) if blob else 0
-        if n_more < 0:
-            raise ValueError(f"a posting of landmark {landmark} is damaged at image {-1 - n_more}")
-        n_placed += n_more
-    if n_placed != lists.size:
-        raise ValueError(f"the postings fill {n_placed} of {lists.size} places of the map images' lists")
-    return lists
-
-
-@njit(cache=True, nogil=True)
-def _read_rice(stream: NDArray[np.uint8], position: int, parameter: int) -> tuple[int, int]:
-    """Read one number from bit `position`; returns it and the next position, or -1 where the stream holds no more."""
-    n_bits = stream.size * 8
-    number = 0
-    while position < n_bits and not (stream[position >> 3] >> (7 - (position & 7))) & 1:
-        number += 1
-        position += 1
-    position += 1
-    if position + parameter > n_bits:
-        return -1, n_bits
-    for _ in range(parameter):
-        number = (number << 1) | ((stream[position >> 3] >> (7 - (position & 7))) & 1)
-        position += 1
-    return number, position
-
-
-@njit(cache=True, nogil=True)
-def _place(blob: NDArray[np.uint8], column: NDArray[np.uint16], landmark: int, empty: int) -> int:
-    """Write the landmark at every image of the blob; returns how many, or -1 - image at a bad one."""
-    parameter = int(blob[0]) & 31
-    run_parameter = (int(blob[0]) >> 5) - 1
-    stream = blob[1:]
-    position, image, n_placed = 0, -1, 0
-    if run_parameter >= 0:
-        image = -2
-    while True:
-        gap, position = _read_rice(stream, position, parameter)
-        if gap < 0:
-            return n_placed
-        length = 0
-        if run_parameter >= 0:
-            length, position = _read_rice(stream, position, run_parameter)
-            if length < 0:
-                return -1 - column.size
-            image += 1
-        for _ in range(length + 1):
-            image += 1 + gap
-            gap = 0
-            if image >= column.size or column[image] != empty:
-                return -1 - image
-            column[image] = landmark
-            n_placed += 1
