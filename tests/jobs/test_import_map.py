@@ -160,7 +160,7 @@ def test_a_domain_that_differs_is_left_alone(exported, importer, parts):
 
 
 def test_every_flipped_byte_that_matters_is_refused(exported, importer, tmp_path):
-    """With the digest every byte matters; without it what the file's own checksum covers does."""
+    """With the digest every byte matters; without it what is no map that makes sense is refused."""
     map_bytes = exported.read_bytes()
     digest = hashlib.sha256(map_bytes).hexdigest()
     bad = tmp_path / "bad.map"
@@ -170,7 +170,7 @@ def test_every_flipped_byte_that_matters_is_refused(exported, importer, tmp_path
         bad.write_bytes(map_bytes[:at] + bytes([map_bytes[at] ^ (1 << rng.integers(8))]) + map_bytes[at + 1 :])
         with pytest.raises(InvalidArchiveError, match="another file"):
             import_map(importer, bad, sha256=digest)
-    places = [map_bytes.index(map_.position_m[10:20].tobytes()) + 11, map_bytes.index(b"feature_l2") + 3, 3]
+    places = [map_bytes.index(map_.position_m[10:20].tobytes()) + 7, map_bytes.index(b"feature_l2") + 3, 3]
     for at in places:
         bad.write_bytes(map_bytes[:at] + bytes([map_bytes[at] ^ 2]) + map_bytes[at + 1 :])
         with pytest.raises(InvalidArchiveError, match="no map that can serve here"):

@@ -127,3 +127,9 @@ def m004_coded_lists(db: Database) -> None:
         ALTER TABLE posting_coded RENAME TO posting;
         """
     )
+
+
+@migrations()
+def m005_without_checksum(db: Database) -> None:
+    """SQLite is trusted with rows; a sealed file has its SHA-256 in the catalog."""
+    db.execute("ALTER TABLE map DROP COLUMN checksum")

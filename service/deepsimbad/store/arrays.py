@@ -18,20 +18,7 @@ _CODES = np.dtype("<u2")
 _TEXT_BYTES = 4 * 256  # most that one text takes
 
 
-class Checksum:
-    """A running CRC-32 over everything a map file says, in one fixed order."""
-
-    def __init__(self) -> None:
-        self.value = 0
-
-    def add(self, *parts: str | int | bytes) -> None:
-        """Continue the checksum with `parts`."""
-        for part in parts:
-            body = part if isinstance(part, bytes) else str(part).encode("ascii", "backslashreplace")
-            self.value = zlib.crc32(body, self.value)
-
-
-def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
+def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write named arrays into an array table; raises InvalidInputError where one does not hold plain numbers."""
     for name, array in sorted(arrays.items()):
         if array.dtype.kind not in "fiu":
@@ -41,11 +28,10 @@ def save_arrays(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
         a_part = PART_BYTES // dtype.itemsize
         for part, start in enumerate(range(0, max(numbers.size, 1), a_part)):
             body = numbers[start : start + a_part].astype(dtype).tobytes()
-            checksum.add(table, name, part, dtype.str, shape, body)
             db.table(table).insert({"name": name, "part": part, "dtype": dtype.str, "shape": shape, "body": body})
 
 
-def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
+def load_arrays(db: Database, table: str) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an array table, frozen; float16 comes back as float32.
 
     Raises ValueError: the rows do not make up arrays.
@@ -57,7 +43,6 @@ def load_arrays(db: Database, table: str, checksum: Checksum) -> dict[str, NDArr
         sizes[row["name"]] += row["n_bytes"]
     for row in db.table(table).rows_where(order_by="name, part"):
         name, dtype, body = row["name"], np.dtype(row["dtype"]), row["body"]
-        checksum.add(table, name, row["part"], row["dtype"], row["shape"], body)
         if name not in arrays:
             dimensions = tuple(from_json(row["shape"]))
             if dtype.kind not in "fiu" or math.prod(dimensions) * dtype.itemsize != sizes[name]:  # before room is made
@@ -83,7 +68,7 @@ def is_halvable(numbers: NDArray[Any]) -> bool:
         return all(np.array_equal(part.astype(np.float16), part) for part in parts)
 
 
-def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], checksum: Checksum) -> None:
+def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write at most one array at two bytes a number: the nearest of 65,536 equal steps from its lowest to its highest.
 
     High bytes lie before low ones, so that values which are alike compress. Raises InvalidInputError on NaN.
@@ -97,22 +82,20 @@ def save_packed(db: Database, table: str, arrays: Mapping[str, NDArray[Any]], ch
         codes = np.ascontiguousarray(np.rint(steps), _CODES)
         body = zlib.compress(codes.reshape(-1, 1).view(np.uint8)[:, ::-1].T.tobytes(), 6)
         shape = to_json(list(array.shape))
-        checksum.add(table, name, 0, _CODES.str, shape, repr(lowest), repr(step), body)
         row = {"part": 0, "name": name, "dtype": _CODES.str, "shape": shape, "lowest": lowest, "step": step}
         db.table(table).insert({**row, "body": body})
 
 
-def load_packed(db: Database, table: str, checksum: Checksum) -> dict[str, NDArray[Any]]:
-    """Read what `save_packed` or the first schema wrote, frozen; nothing where the map never learnt.
+def load_packed(db: Database, table: str) -> dict[str, NDArray[Any]]:
+    """Read what `save_packed` wrote; nothing where the map never learnt.
 
     Raises ValueError: the row does not make up an array.
     """
-    rows = list(db.table(table).rows_where("step IS NOT NULL"))
+    rows = list(db.table(table).rows)
     if not rows:
-        return load_arrays(db, table, checksum)
+        return {}
     row = rows[0]
     lowest, step, body = row["lowest"], row["step"], row["body"]
-    checksum.add(table, row["name"], row["part"], row["dtype"], row["shape"], repr(lowest), repr(step), body)
     shape = tuple(from_json(row["shape"]))
     n_bytes = math.prod(shape) * _CODES.itemsize
     try:

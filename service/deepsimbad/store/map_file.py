@@ -22,15 +22,7 @@ from deepsimbad.errors import (
     InvalidRouteError,
     NoActiveMapError,
 )
-from deepsimbad.store.arrays import (
-    Checksum,
-    load_arrays,
-    load_packed,
-    pack_texts,
-    save_arrays,
-    save_packed,
-    unpack_texts,
-)
+from deepsimbad.store.arrays import load_arrays, load_packed, pack_texts, save_arrays, save_packed, unpack_texts
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.connection import check_integrity, in_todays_schema, open_database
 from deepsimbad.store.durable import remove_database, sha256_of, storage_faults, sync, verify, written_aside
@@ -38,19 +30,6 @@ from deepsimbad.store.records import MapRecord, from_json, to_json
 from deepsimbad_migrations.map.migrations import migrations
 
 _AS_JSON = frozenset({"config", "evaluator", "actions_m", "metrics"})  # columns of `map`
-_DESCRIPTION = (  # the columns of `map` in the order of the checksum
-    "domain",
-    "version",
-    "created_at",
-    "config",
-    "evaluator",
-    "closed",
-    "actions_m",
-    "metrics",
-    "n_map_images",
-    "n_landmarks",
-    "list_length",
-)
 _WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
 _PAGE_SIZES = (65536, 32768, 16384, 8192, 4096, 2048, 1024, 512)
 _ROW_OVERHEAD = 12  # cell pointer, cell and record headers, the number of a block
@@ -104,28 +83,25 @@ def write_map(path: Path, map_: Map, on_progress: Callable[[float], None] = lamb
 
 
 def _write(db: Database, map_: Map, blocks: list[bytes], on_progress: Callable[[float], None]) -> None:
-    checksum = Checksum()
     description = {
         column: to_json(value) if column in _AS_JSON else int(value) if isinstance(value, bool) else value
         for column, value in map_.document().items()
     }
-    checksum.add(*(description[column] for column in _DESCRIPTION))
-    checksum.add(*blocks)
     db.conn.executemany("INSERT INTO posting (body) VALUES (?)", [(block,) for block in blocks])
     on_progress(0.5)
-    save_arrays(db, _MODEL_TABLE, map_.landmark_model, checksum)
+    save_arrays(db, _MODEL_TABLE, map_.landmark_model)
     arrays = {
         name: pack_texts(array) if name in _TEXTS else array for name, array in map_.arrays().items() if name != "lists"
     }
     for table in _TABLES:
         table_arrays = {name: array for name, array in arrays.items() if _TABLE_OF.get(name, "calibration") == table}
-        (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, table_arrays, checksum)
+        (save_packed if table == _PACKED_TABLE else save_arrays)(db, table, table_arrays)
         on_progress(0.7)
-    db.table("map").insert({"id": 1, **description, "checksum": checksum.value})
+    db.table("map").insert({"id": 1, **description})
 
 
 def read_map(path: Path) -> Map:
-    """Read a map file whole and check it against its own checksum.
+    """Read a map file whole.
 
     A file of an older schema is brought to today's in memory; the sealed file stays as it is.
 
@@ -147,20 +123,15 @@ def _read(db: Database, path: Path) -> Map:
     if not rows:
         raise DamagedMapError(f"{path.name} is damaged: it was never finished", file=path.name)
     row = rows[0]
-    checksum = Checksum()
-    checksum.add(*(row[column] for column in _DESCRIPTION))
     blocks = [body for (body,) in db.execute("SELECT body FROM posting ORDER BY part")]
-    checksum.add(*blocks)
-    model = load_arrays(db, _MODEL_TABLE, checksum)
+    model = load_arrays(db, _MODEL_TABLE)
     arrays: dict[str, NDArray[Any]] = {}
     for table in _TABLES:
-        arrays |= (load_packed if table == _PACKED_TABLE else load_arrays)(db, table, checksum)
-    if checksum.value != row["checksum"]:
-        raise DamagedMapError(f"{path.name} is damaged: it does not match its checksum", file=path.name)
+        arrays |= (load_packed if table == _PACKED_TABLE else load_arrays)(db, table)
     arrays |= {name: unpack_texts(arrays[name], row[_TEXTS[name]]) for name in _TEXTS.keys() & arrays.keys()}
     shape = row["list_length"], row["n_map_images"], row["n_landmarks"]
     arrays["lists"] = unpack_lists(blocks, *shape, model.get("prototypes"))
-    document = {name: from_json(row[name]) if name in _AS_JSON else row[name] for name in _DESCRIPTION}
+    document = {name: from_json(value) if name in _AS_JSON else value for name, value in row.items() if name != "id"}
     return Map.from_arrays(document, model, arrays, _bytes_by_table(db)["posting"])
 
 
