@@ -18,7 +18,7 @@ from deepsimbad.store import catalog_maps
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import ANY
 from deepsimbad.store.layout import catalog_path
-from deepsimbad.store.records import KeptMap, MapState
+from deepsimbad.store.records import MapRecord, MapState
 
 from .conftest import N_IMAGES, Clock, Service, add_domain, add_map, map_contents, open_service
 
@@ -129,10 +129,10 @@ def surplus_of(history: str, keep_maps: int) -> list[int]:
         keep_maps: How many of each kind are kept.
     """
     states = {"s": MapState.SEALED, "a": MapState.ACTIVE}
-    versions = [
-        KeptMap("d", version, states.get(word, MapState.RETIRED), f"200{word}" if word in "123456789" else None)
-        for version, word in enumerate(history, 1)
-    ]
+    versions = []
+    for version, word in enumerate(history, 1):
+        state, retired_at = states.get(word, MapState.RETIRED), f"200{word}" if word in "123456789" else None
+        versions.append(MapRecord("d", version, state, "2000", None, None, {}, {}, None, retired_at, None))
     return sorted(version.version for version in surplus_versions(versions, keep_maps))
 
 

@@ -298,15 +298,6 @@ def test_a_backup_that_would_run_what_its_maker_wrote_is_refused(
     assert not (tmp_path / "there").exists()
 
 
-def test_a_backup_of_an_older_release_comes_back(archive: Path, tmp_path: Path) -> None:
-    """Its last member is a digest of all that lies before it."""
-    with tarfile.open(archive, "a") as tar:
-        info = tarfile.TarInfo("archive.sha256")
-        info.size = 64
-        tar.addfile(info, io.BytesIO(b"0" * 64))
-    assert restore(archive, tmp_path / "there", silent).n_files == 6
-
-
 def test_only_an_empty_folder_is_restored_into(archive: Path, furnished: Catalog, tmp_path: Path) -> None:
     with pytest.raises(ConflictError, match="not empty"):
         restore(archive, furnished.data_dir, silent)

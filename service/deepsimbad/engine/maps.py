@@ -27,7 +27,7 @@ from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.catalog_maps import removal_error
 from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.map_file import read_map
-from deepsimbad.store.records import DomainRecord, KeptMap, MapState, current_moment
+from deepsimbad.store.records import DomainRecord, MapRecord, MapState, current_moment
 from deepsimbad.store.sessions import SessionStore
 
 log = logging.getLogger(__name__)
@@ -379,9 +379,9 @@ class Retention:
         self._catalog.remove_map(domain, version, is_pinned)
 
 
-def surplus_versions(versions: Iterable[KeptMap], keep_maps: int) -> list[KeptMap]:
+def surplus_versions(versions: Iterable[MapRecord], keep_maps: int) -> list[MapRecord]:
     """The versions that no domain keeps, pinned or not, of versions that have their files and are ordered by domain."""
-    surplus: list[KeptMap] = []
+    surplus: list[MapRecord] = []
     for _, of_domain in groupby(versions, lambda version: version.domain):
         newest_first = sorted(of_domain, key=lambda version: (version.retired_at or "", version.version), reverse=True)
         retired = [version for version in newest_first if version.state is MapState.RETIRED]

@@ -37,7 +37,6 @@ Progress = Callable[[float], None]
 _FORMAT = {"format": "deepsimbad-backup", "format_version": 1}
 _MANIFEST = "manifest.json"
 _CATALOG, _SESSIONS = "catalog.sqlite", "sessions.sqlite"
-_OLD_DIGEST_MEMBER = "archive.sha256"  # a digest of all before it, which the members' own make needless
 _MEMBERS: dict[str, Migrations] = {
     r"catalog\.sqlite": catalog_migrations,
     r"sessions\.sqlite": session_migrations,
@@ -249,7 +248,7 @@ def restore(file: Path, data_dir: Path, on_progress: Progress) -> RestoreReport:
 def _manifest(tar: tarfile.TarFile, file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Read the manifest and its members, which must be those that the backup holds; raises InvalidArchiveError."""
     try:
-        infos = [info for info in tar.getmembers() if info.name not in {_MANIFEST, _OLD_DIGEST_MEMBER}]
+        infos = [info for info in tar.getmembers() if info.name != _MANIFEST]
         stream = tar.extractfile(_MANIFEST)
         manifest = json.load(stream) if stream else {}
         members = [

@@ -22,7 +22,6 @@ from deepsimbad.store import layout
 from deepsimbad.store.connection import OpenFile, open_database
 from deepsimbad.store.durable import lock_folder, remove_database, sync, verify
 from deepsimbad.store.records import (
-    KeptMap,
     ListPage,
     MapRecord,
     MapState,
@@ -33,8 +32,7 @@ from deepsimbad.store.records import (
 )
 
 _SELECT_MAP = """
-    SELECT version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at,
-           domain
+    SELECT domain, version, state, created_at, sha256, file_bytes, config, metrics, activated_at, retired_at, removed_at
     FROM map
 """
 _MAX_INTEGER = 2**63 - 1
@@ -179,7 +177,7 @@ class MapCatalog(OpenFile):
                 db.table("map").update((domain, version), {"state": MapState.ACTIVE, "activated_at": current_moment()})
             return _get_map(db, domain, version)
 
-    def kept_maps(self, domain: str | None = None, min_beside: int = -1) -> list[KeptMap]:
+    def kept_maps(self, domain: str | None = None, min_beside: int = -1) -> list[MapRecord]:
         """The sealed versions that still have their files, by domain, oldest first.
 
         Args:
@@ -188,17 +186,16 @@ class MapCatalog(OpenFile):
         """
         with self._reading() as db:
             rows = db.execute(
-                """
-                SELECT domain, version, state, retired_at FROM map
-                WHERE state != 'building' AND removed_at IS NULL AND domain IN (
+                f"""
+                {_SELECT_MAP} WHERE state != 'building' AND removed_at IS NULL AND domain IN (
                     SELECT domain FROM map
                     WHERE state != 'building' AND removed_at IS NULL AND domain = coalesce(?, domain)
                     GROUP BY domain HAVING sum(state != 'active') > ?
                 ) ORDER BY domain, version
-                """,
+                """,  # noqa: S608 - of our own words
                 [domain, min_beside],
             )
-            return [KeptMap(domain, version, MapState(state), *times) for domain, version, state, *times in rows]
+            return list(map(_map, rows))
 
     def remove_map(self, domain: str, version: int, is_pinned: Callable[[], bool]) -> None:
         """Remove the file of a version; its row stays, retired.
@@ -286,7 +283,7 @@ class MapCatalog(OpenFile):
                 f"{_SELECT_MAP} WHERE state = 'active' AND domain IN (SELECT value FROM json_each(?))",  # noqa: S608
                 [to_json(list(domains))],
             )
-            return {row[-1]: _map(row) for row in rows}
+            return {record.domain: record for record in map(_map, rows)}
 
     def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
         """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
@@ -331,10 +328,9 @@ def _get_map(db: Database, domain: str, version: int) -> MapRecord:
 
 
 def _map(row: Sequence[Any]) -> MapRecord:
-    version, state, created_at, sha256, file_bytes, config, metrics, *times, _ = row
-    return MapRecord(
-        version, MapState(state), created_at, sha256, file_bytes, from_json(config), from_json(metrics), *times
-    )
+    domain, version, state, created_at, sha256, file_bytes, config, metrics, *times = row
+    documents = from_json(config), from_json(metrics)
+    return MapRecord(domain, version, MapState(state), created_at, sha256, file_bytes, *documents, *times)
 
 
 def _check_is_building(db: Database, domain: str, version: int) -> None:

@@ -110,6 +110,7 @@ def get_domain(db: Database, name: str) -> DomainRecord:
 class MapRecord:
     """One map version of a domain; when it last began to serve, last ceased to, and when its file was removed."""
 
+    domain: str
     version: int
     state: MapState
     created_at: str
@@ -120,16 +121,6 @@ class MapRecord:
     activated_at: str | None
     retired_at: str | None
     removed_at: str | None
-
-
-@dataclass(frozen=True)
-class KeptMap:
-    """A sealed map version that still has its file."""
-
-    domain: str
-    version: int
-    state: MapState
-    retired_at: str | None
 
 
 @dataclass(frozen=True)
