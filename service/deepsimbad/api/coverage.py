@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
 from numpy.typing import NDArray
 from pydantic import Field
@@ -13,15 +13,12 @@ from typing_extensions import TypedDict
 
 from deepsimbad.api.localizations import FrameName
 from deepsimbad.api.problems import problems
-from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, RunningServices, Services, StrictRoute
+from deepsimbad.api.requests import GREATEST_ID, JSON, DomainName, PinnedVersion, RunningServices, StrictRoute
 from deepsimbad.core.map import Map
 from deepsimbad.core.rehearsal import WITHIN_M, worst_stretches
 
 router = APIRouter(prefix="/v1/domains", tags=["domains"], route_class=StrictRoute)
 
-PinnedVersion = Annotated[
-    int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")
-]
 Metres = list[float | None] | None
 
 
@@ -62,17 +59,11 @@ class CoverageAnswer(TypedDict):
 @router.get("/{domain}/coverage", response_model=CoverageAnswer, responses=problems(404, 409, 410, 422))
 async def get_coverage(domain: DomainName, services: RunningServices, map_version: PinnedVersion = None) -> Response:
     """For every map image the chance that a single view there is placed rightly; worst stretches first."""
-    snapshot = await _snapshot(services, domain, map_version)
+    snapshot = await services.snapshot(domain, map_version)
     record = await run_sync(services.catalog.map, domain, snapshot.version)
     n_bytes = await run_sync(services.pictures.n_bytes, domain)
     _, body = await services.render_json(snapshot.n_images, render_coverage, snapshot, record.metrics, n_bytes)
     return Response(body, media_type=JSON)
-
-
-async def _snapshot(services: Services, domain: str, version: int | None) -> Map:
-    if version is None:
-        return (await services.active(domain)).snapshot
-    return await run_sync(services.maps.snapshot, domain, version)
 
 
 def render_coverage(snapshot: Map, metrics: Mapping[str, Any], thumbnail_bytes: int) -> CoverageAnswer:
@@ -136,7 +127,7 @@ class LandmarksAnswer(TypedDict):
 @router.get("/{domain}/landmarks", response_model=LandmarksAnswer, responses=problems(404, 409, 410, 422))
 async def get_landmarks(domain: DomainName, services: RunningServices, map_version: PinnedVersion = None) -> Response:
     """A map's landmarks: the frames they began as, and how many map images list each."""
-    snapshot = await _snapshot(services, domain, map_version)
+    snapshot = await services.snapshot(domain, map_version)
     n_bytes = await run_sync(services.pictures.n_bytes, domain)
     _, body = await services.render_json(snapshot.n_landmarks, render_landmarks, snapshot, n_bytes)
     return Response(body, media_type=JSON)
@@ -181,7 +172,7 @@ async def get_landmark_thumbnail(
     map_version: PinnedVersion = None,
 ) -> Response:
     """A small picture of the frame that a landmark began as, where the domain keeps them (`thumbnails`)."""
-    snapshot = await _snapshot(services, domain, map_version)
+    snapshot = await services.snapshot(domain, map_version)
     content = await run_sync(services.pictures.of_frame, snapshot, snapshot.landmark_digest, index)
     return Response(content, media_type="image/jpeg")
 
@@ -194,6 +185,6 @@ async def get_thumbnail(
     map_version: PinnedVersion = None,
 ) -> Response:
     """A small picture of a map image, where the domain keeps them (`thumbnails`)."""
-    snapshot = await _snapshot(services, domain, map_version)
+    snapshot = await services.snapshot(domain, map_version)
     content = await run_sync(services.pictures.of_frame, snapshot, snapshot.frame_digest, index)
     return Response(content, media_type="image/jpeg")

@@ -6,14 +6,12 @@ from http import HTTPStatus
 from typing import Annotated, Any, Self
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
+from fastapi import APIRouter, BackgroundTasks, Request, Response
 from pydantic import Field, model_validator
 
-from deepsimbad.api.geopose import AnchorBody
 from deepsimbad.api.problems import binary, declare_json, problems
 from deepsimbad.api.requests import (
     BINARY,
-    GREATEST_ID,
     NAME_PATTERN,
     REVALIDATE,
     Answer,
@@ -21,6 +19,7 @@ from deepsimbad.api.requests import (
     JsonBody,
     Next,
     Page,
+    PinnedVersion,
     RunningServices,
     StrictRoute,
     has_tag,
@@ -47,7 +46,6 @@ log = logging.getLogger(__name__)
 
 # Bodies and answers
 
-
 _EVALUATOR_SCHEMA = {
     "type": "object",
     "required": ["kind"],
@@ -58,6 +56,18 @@ _EVALUATOR_SCHEMA = {
     },
     "additionalProperties": False,
 }
+
+
+Degrees = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+class AnchorBody(JsonBody):
+    """Where the origin of x and y lies on Earth, and how they are turned."""
+
+    lat_deg: Annotated[Degrees, Field(ge=-90, le=90)]
+    lon_deg: Annotated[Degrees, Field(ge=-180, le=180)]
+    bearing_deg: Annotated[Degrees, Field(ge=0, lt=360, description="Of the axis y, clockwise from north.")] = 0.0
+    height_m: Annotated[float, Field(strict=True, allow_inf_nan=False, description="Above the ellipsoid.")] = 0.0
 
 
 class DomainBody(JsonBody):
@@ -186,26 +196,22 @@ def describe_domain(record: DomainRecord, evaluators: EvaluatorPool, maps: Maps)
 
 
 @router.get("", responses=problems(422))
-async def list_domains(request: Request, services: RunningServices, page: DomainPage) -> DomainList:
+def list_domains(request: Request, services: RunningServices, page: DomainPage) -> DomainList:
     """All domains, by name, a thousand an answer; of cold ones the maps are read."""
     key_domains = request.scope["state"].get("domains")  # to this key; None: all
-
-    def describe_page() -> DomainList:
-        answers, domain_page = [], services.catalog.domain_page(page.key, page.limit)
-        for record in domain_page.records:
-            if key_domains is not None and record.name not in key_domains:
-                continue
-            with suppress(UnknownDomainError):  # deleted since it was listed
-                answers.append(describe_domain(record, services.evaluators, services.maps))
-        return DomainList(domains=answers, next=page.next(domain_page.last_key))
-
-    return await run_sync(describe_page)
+    answers, domain_page = [], services.catalog.domain_page(page.key, page.limit)
+    for record in domain_page.records:
+        if key_domains is not None and record.name not in key_domains:
+            continue
+        with suppress(UnknownDomainError):  # deleted since it was listed
+            answers.append(describe_domain(record, services.evaluators, services.maps))
+    return DomainList(domains=answers, next=page.next(domain_page.last_key))
 
 
 @router.get("/{domain}", responses=problems(404, 422))
-async def get_domain(domain: DomainName, services: RunningServices) -> DomainAnswer:
+def get_domain(domain: DomainName, services: RunningServices) -> DomainAnswer:
     """One domain and its active map."""
-    return await run_sync(lambda: describe_domain(services.catalog.domain(domain), services.evaluators, services.maps))
+    return describe_domain(services.catalog.domain(domain), services.evaluators, services.maps)
 
 
 @router.get(
@@ -227,20 +233,15 @@ async def get_landmark_model(
     domain: DomainName,
     request: Request,
     services: RunningServices,
-    map_version: Annotated[
-        int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")
-    ] = None,
+    map_version: PinnedVersion = None,
 ) -> Response:
     """The landmarks of a map, for a robot that encodes on board and sends ranks.
 
     What it sends with the tag in `If-Match` is never compared with other landmarks.
     """
+    snapshot = await services.snapshot(domain, map_version)
 
     def pack() -> tuple[str, bytes | None]:
-        if map_version is None:
-            snapshot = services.maps.active(domain).snapshot
-        else:
-            snapshot = services.maps.snapshot(domain, map_version)
         etag = f'"{snapshot.landmark_model_digest}"'
         is_known = has_tag(request.headers.get("if-none-match"), etag)
         return etag, None if is_known else snapshot.portable_landmarks()

@@ -3,7 +3,6 @@
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
@@ -17,16 +16,16 @@ from deepsimbad.store.sessions import SessionRecord
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"], route_class=StrictRoute)
 
 
-async def _session(session_id: SessionId, request: Request, services: RunningServices) -> SessionRecord:
+def _session(session_id: SessionId, request: Request, services: RunningServices) -> SessionRecord:
     """The session of the path, so that an unknown one is refused before a stream begins."""
-    return await run_sync(services.session_events.find, session_id, robot_of(request))
+    return services.session_events.find(session_id, robot_of(request))
 
 
-async def _followable_session(
+def _followable_session(
     session: Annotated[SessionRecord, Depends(_session)], services: RunningServices
 ) -> SessionRecord:
     """The session of the path, so that one whose map is no more is refused before a stream begins."""
-    await run_sync(services.sessions.engine_of, session)
+    services.sessions.engine_of(session)
     return session
 
 
@@ -89,7 +88,7 @@ async def get_session_events(
         **problems(404, 410, 422),
     },
 )
-async def get_view(session: Annotated[SessionRecord, Depends(_session)], services: RunningServices) -> Response:
+def get_view(session: Annotated[SessionRecord, Depends(_session)], services: RunningServices) -> Response:
     """What the robot saw last, as a small picture; held in memory alone, for people who look on."""
-    content = await run_sync(services.pictures.view, session.session_id)
+    content = services.pictures.view(session.session_id)
     return Response(status_code=204) if content is None else Response(content, media_type="image/jpeg")

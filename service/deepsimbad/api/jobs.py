@@ -250,9 +250,9 @@ async def post_experience(
     return JobAnswer.model_validate(job)
 
 
-async def _job(job_id: JobId, services: RunningServices) -> JobRecord:
+def _job(job_id: JobId, services: RunningServices) -> JobRecord:
     """The job of the path, so that an unknown one is refused before a stream begins."""
-    return await run_sync(services.catalog.job, job_id)
+    return services.catalog.job(job_id)
 
 
 async def room_for_a_stream(services: RunningServices) -> AsyncIterator[None]:
@@ -262,11 +262,9 @@ async def room_for_a_stream(services: RunningServices) -> AsyncIterator[None]:
 
 
 @router.get("", responses=problems(404, 422))
-async def list_jobs(
-    services: RunningServices, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None
-) -> JobList:
+def list_jobs(services: RunningServices, page: Annotated[Page, page_of("jobs")], domain: OfDomain = None) -> JobList:
     """Jobs, newest first."""
-    job_page = await run_sync(services.newest_jobs, domain, page.number, page.limit)
+    job_page = services.newest_jobs(domain, page.number, page.limit)
     return JobList.model_validate({"jobs": job_page.records, "next": page.next(job_page.last_key)})
 
 
@@ -310,6 +308,6 @@ async def get_job_events(
 
 
 @router.delete("/{job_id}", status_code=204, responses=problems(404, 422))
-async def cancel_job(job_id: JobId, services: RunningServices) -> None:
+def cancel_job(job_id: JobId, services: RunningServices) -> None:
     """Ask a job to stop; one that has ended stays as it is."""
-    await run_sync(services.runner.cancel, job_id)
+    services.runner.cancel(job_id)

@@ -1,5 +1,6 @@
 """Where a single view places the robot, from a uniform prior; and what every answer to a view is made of."""
 
+import math
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Annotated, Any, cast
@@ -12,7 +13,6 @@ from pydantic import FailFast, Field, StrictFloat, StrictInt
 from pydantic_core import to_json
 from typing_extensions import TypedDict
 
-from deepsimbad.api.geopose import GEOPOSE, AnchorBody, render_geopose, wants_geopose
 from deepsimbad.api.problems import binary, declare, invalid_body, problems
 from deepsimbad.api.requests import (
     BINARY,
@@ -36,6 +36,7 @@ from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
 from deepsimbad.core.on_board import RANKS, UNIT_ENCODING
 from deepsimbad.core.planners import PROBABLY, Plan
+from deepsimbad.core.route import on_earth
 from deepsimbad.engine.localizer import (
     Dissimilarities,
     Localization,
@@ -51,6 +52,7 @@ from deepsimbad.engine.localizer import (
     shortlist_length,
 )
 from deepsimbad.engine.worker import EncodedImage, Priority, Stopwatch
+from deepsimbad.errors import NotAcceptableError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.grey_levels import levels_in
 from deepsimbad.evaluators.image_files import MEDIA_TYPES
@@ -59,6 +61,7 @@ WARNING_PROBABILITY = 0.5
 router = APIRouter(prefix="/v1/domains", tags=["localization"], route_class=QuickRoute)
 
 MAX_LANDMARKS = 0xFFFF
+GEOPOSE = "application/geopose+json"
 
 # Bodies
 
@@ -292,6 +295,37 @@ def render_belief(snapshot: Map, belief: BeliefSummary, is_confident: bool) -> B
     }
 
 
+def render_geopose(snapshot: Map, anchor: Mapping[str, float] | None, image: int) -> dict[str, dict[str, float]]:
+    """A map image as a GeoPose (OGC 21-056r11, Basic-YPR): where on Earth, and which way the route leads there.
+
+    Degrees, and metres above the ellipsoid; yaw runs from east towards north.
+
+    Args:
+        anchor: The members of the domain's `AnchorBody`; None: it has none.
+
+    Raises:
+        NotAcceptableError: The domain has no anchor, or nobody knows where that image was taken, or which way.
+    """
+    if anchor is None:
+        raise NotAcceptableError(
+            f"domain {snapshot.domain} has no anchor: PUT it with anchor {{lat_deg, lon_deg, bearing_deg}} first",
+            reason="no_anchor",
+        )
+    route = snapshot.route
+    heading_rad = float(route.heading_rad[image])
+    if route.x_m is None or route.y_m is None or not math.isfinite(heading_rad):
+        raise NotAcceptableError(
+            f"map {snapshot.version} of domain {snapshot.domain} knows no x and y there: map a traverse that has them",
+            reason="no_heading",
+        )
+    latitude_deg, longitude_deg = on_earth(float(route.x_m[image]), float(route.y_m[image]), **anchor)
+    yaw_deg = (math.degrees(heading_rad - math.radians(anchor["bearing_deg"])) + 180) % 360 - 180
+    return {
+        "position": {"lat": latitude_deg, "lon": longitude_deg, "h": anchor["height_m"]},
+        "angles": {"yaw": yaw_deg, "pitch": 0.0, "roll": 0.0},
+    }
+
+
 # Handlers
 
 
@@ -345,11 +379,9 @@ async def post_localization(
         return localize(snapshot, evaluator, view, shortlist, watch)
 
     localization = await services.worker.computed(look, is_short=is_short(snapshot, view, shortlist))
-    if wants_geopose(request):
+    if prefers(request, GEOPOSE):
         record = await run_sync(services.catalog.domain, domain)  # as it is now
-        anchor = record.options.get("anchor")
-        mode = int(localization.belief.top[0])
-        geopose = render_geopose(snapshot, None if anchor is None else AnchorBody(**anchor), mode)
+        geopose = render_geopose(snapshot, record.options.get("anchor"), int(localization.belief.top[0]))
         return Response(to_json(geopose), media_type=GEOPOSE)
     answer, body = await services.render_json(
         localization.belief.top.size, render_localization, localization, watch, remarks

@@ -4,7 +4,6 @@ import base64
 import logging
 import re
 from http import HTTPStatus
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from anyio.to_thread import run_sync
@@ -86,9 +85,9 @@ class MapList(Answer):
 
 
 @router.get("/{domain}/maps", responses=problems(404, 422))
-async def list_maps(domain: DomainName, services: RunningServices, page: Annotated[Page, page_of("maps")]) -> MapList:
+def list_maps(domain: DomainName, services: RunningServices, page: Annotated[Page, page_of("maps")]) -> MapList:
     """The history of a domain's map, newest version first."""
-    map_page = await run_sync(services.catalog.newest_maps, domain, page.number, page.limit)
+    map_page = services.catalog.newest_maps(domain, page.number, page.limit)
     return MapList.model_validate({"maps": map_page.records, "next": page.next(map_page.last_key)})
 
 
@@ -116,12 +115,12 @@ async def put_active_map(domain: DomainName, request: Request, services: Running
 
 
 @router.delete("/{domain}/maps/{version}", status_code=204, responses=problems(404, 409, 410, 422))
-async def delete_map(domain: DomainName, version: MapVersion, services: RunningServices) -> None:
+def delete_map(domain: DomainName, version: MapVersion, services: RunningServices) -> None:
     """Remove the file of a version; it stays in the history, retired.
 
     The version that serves, one being built and one that a session lives on are a 409.
     """
-    await run_sync(services.retention.remove, domain, version)
+    services.retention.remove(domain, version)
     log.info("map removed", extra={"domain": domain, "map_version": version})
 
 
@@ -135,27 +134,20 @@ async def delete_map(domain: DomainName, version: MapVersion, services: RunningS
         **problems(404, 410, 416, 422),
     },
 )
-async def get_map_file(
-    domain: DomainName, version: MapVersion, request: Request, services: RunningServices
-) -> Response:
+def get_map_file(domain: DomainName, version: MapVersion, request: Request, services: RunningServices) -> Response:
     """A sealed version whole, as one SQLite file that another server can import.
 
     It is read against its digest before the first byte is sent; `Repr-Digest` and `ETag` tell that digest.
     """
-
-    def check() -> tuple[Path, str, int]:
-        sha256 = services.catalog.sealed_digest(domain, version)
-        try:
-            path = services.catalog.map_file(domain, version)
-        except DamagedMapError as error:
-            raise unreadable_error(services.catalog, domain, version) from error
-        return path, sha256, path.stat().st_size
-
-    path, sha256, n_bytes = await run_sync(check)
+    sha256 = services.catalog.sealed_digest(domain, version)
+    try:
+        path = services.catalog.map_file(domain, version)
+    except DamagedMapError as error:
+        raise unreadable_error(services.catalog, domain, version) from error
     etag = f'"sha256:{sha256}"'
     if has_tag(request.headers.get("if-none-match"), etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**REVALIDATE, "ETag": etag})
-    request.scope["headers"] = one_range(request.scope["headers"], n_bytes)
+    request.scope["headers"] = one_range(request.scope["headers"], path.stat().st_size)
     repr_digest = base64.b64encode(bytes.fromhex(sha256)).decode()
     headers = {**REVALIDATE, "ETag": etag, "Repr-Digest": f"sha-256=:{repr_digest}:"}
     return FileResponse(path, headers=headers, media_type=MEDIA_TYPE, filename=f"{domain}-{version:06d}.sqlite")

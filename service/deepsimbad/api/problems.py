@@ -6,7 +6,6 @@ handlers read themselves, keys, links and examples.
 
 import json
 import logging
-import math
 import re
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
@@ -81,8 +80,8 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
 ) -> Response:
     """Render one problem, with hints as further members; its code and the limit met are noted for the log."""
-    document = {name: _json_ready(value) for name, value in (hints or {}).items()}
-    document |= {
+    document = {
+        **(hints or {}),
         "type": f"urn:deepsimbad:problem:{code}",
         "title": title or _TITLE_OF_CODE.get(code) or HTTPStatus(status).phrase,
         "status": status,
@@ -101,7 +100,8 @@ def problem_response(
     if status in {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS}:
         sent_headers.setdefault("Retry-After", str(RETRY_AFTER_S))
     # json escapes everything outside ASCII, so text that cannot be encoded (lone surrogates) still travels.
-    return Response(json.dumps(document).encode("ascii"), status, headers=sent_headers, media_type=MEDIA_TYPE)
+    content = json.dumps(document, default=lambda scalar: scalar.item()).encode("ascii")  # numpy's
+    return Response(content, status, headers=sent_headers, media_type=MEDIA_TYPE)
 
 
 def error_response(scope: Scope, error: DeepSimbadError) -> Response:
@@ -173,19 +173,6 @@ def _instance(scope: Scope) -> str:
     """The path as it was sent, percent-encoding kept, so that it is ASCII."""
     raw: bytes = scope.get("raw_path") or b""
     return raw.partition(b"?")[0].decode("ascii", "backslashreplace") or "/"
-
-
-def _json_ready(value: Any) -> Any:
-    """The value with numpy scalars, tuples and non-finite numbers made sendable."""
-    if isinstance(value, Mapping):
-        return {str(name): _json_ready(member) for name, member in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_json_ready(member) for member in value]
-    if hasattr(value, "item"):
-        return _json_ready(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
 
 
 # The document

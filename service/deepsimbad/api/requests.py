@@ -27,6 +27,7 @@ from starlette.types import Receive, Scope, Send
 from deepsimbad.api.keys import KeyRing
 from deepsimbad.api.metrics import Metrics
 from deepsimbad.api.problems import InvalidRequestError, invalid_body, invalid_request
+from deepsimbad.core.map import Map
 from deepsimbad.engine.atlas import Atlas, Owners
 from deepsimbad.engine.decoders import Decoders
 from deepsimbad.engine.distant import encoded
@@ -162,6 +163,12 @@ class Services:
         mapped_domain = self.maps.peek(domain)
         return mapped_domain if mapped_domain is not None else await run_sync(self.maps.active, domain)
 
+    async def snapshot(self, domain: str, version: int | None) -> Map:
+        """A version of a domain's map, the active one where it is None; files are read in a thread."""
+        if version is None:
+            return (await self.active(domain)).snapshot
+        return await run_sync(self.maps.snapshot, domain, version)
+
     async def encoded(self, evaluator: Evaluator, view: View) -> View:
         """An `EncodedImage` in the place of an image or a scene; other views as they are."""
         if isinstance(view, np.ndarray | Scene):
@@ -263,6 +270,9 @@ Name = Annotated[
 ]
 DomainName = Annotated[str, Path(alias="domain", pattern=NAME_PATTERN, description="A domain's name.")]
 SessionId = Annotated[str, Path(pattern=NAME_PATTERN, description="A session's id.")]
+PinnedVersion = Annotated[
+    int | None, Query(ge=1, le=GREATEST_ID, description="One a session is pinned to; absent: the active one.")
+]
 OfDomain = Annotated[str | None, Query(pattern=NAME_PATTERN, description="Only this domain's; absent: all.")]
 
 Next = Annotated[str | None, Field(description="Ask for the list `after` this for its next page; null: it ends here.")]

@@ -146,62 +146,50 @@ async def post_traverse(
 
 
 @router.get("", responses=problems(404, 422))
-async def list_traverses(
+def list_traverses(
     domain: DomainName,
     services: RunningServices,
     page: Annotated[Page, page_of("traverses", NAME_PATTERN.removeprefix("^"))],
 ) -> TraverseList:
     """The traverses of a domain, by name."""
     data_dir = services.settings.data_dir
-
-    def describe() -> TraverseList:
-        services.catalog.domain(domain)
-        names = [name for name in Traverse.list(data_dir, domain) if name > (page.key or "")]
-        name_page = ListPage.of(((name, name) for name in names), page.limit)
-        answers = []
-        for name in name_page.records:  # a file each, so that those of other pages stay closed
-            with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, name) as traverse:
-                answers.append(TraverseAnswer.model_validate(traverse.summary()))
-        return TraverseList(traverses=answers, next=page.next(name_page.last_key))
-
-    return await run_sync(describe)
+    services.catalog.domain(domain)
+    names = [name for name in Traverse.list(data_dir, domain) if name > (page.key or "")]
+    name_page = ListPage.of(((name, name) for name in names), page.limit)
+    answers = []
+    for name in name_page.records:  # a file each, so that those of other pages stay closed
+        with suppress(UnknownTraverseError), Traverse.open(data_dir, domain, name) as traverse:
+            answers.append(TraverseAnswer.model_validate(traverse.summary()))
+    return TraverseList(traverses=answers, next=page.next(name_page.last_key))
 
 
 @router.get("/{name}", responses=problems(404, 422))
-async def get_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> TraverseAnswer:
+def get_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> TraverseAnswer:
     """What has arrived of a traverse, and which of its frames are missing."""
-
-    def describe() -> TraverseAnswer:
-        services.catalog.domain(domain)
-        data_dir = services.settings.data_dir
-        with Traverse.open(data_dir, domain, name) as traverse:
-            summary = traverse.summary()
-        warnings = [*summary.warnings]
-        for other in Traverse.list(data_dir, domain) if summary.cameras else ():
-            camera = None
-            with suppress(UnknownTraverseError):
-                camera = None if other == name else Traverse.main_camera(data_dir, domain, other)
-            other_pictures = f"those of traverse {other}"
-            if camera is not None and (difference := summary.cameras[0].unlike([camera], other_pictures)) is not None:
-                warnings.append(f"its pictures are not like {other_pictures}: {difference}")
-        return TraverseAnswer.model_validate(replace(summary, warnings=tuple(warnings)))
-
-    return await run_sync(describe)
+    services.catalog.domain(domain)
+    data_dir = services.settings.data_dir
+    with Traverse.open(data_dir, domain, name) as traverse:
+        summary = traverse.summary()
+    warnings = [*summary.warnings]
+    for other in Traverse.list(data_dir, domain) if summary.cameras else ():
+        camera = None
+        with suppress(UnknownTraverseError):
+            camera = None if other == name else Traverse.main_camera(data_dir, domain, other)
+        other_pictures = f"those of traverse {other}"
+        if camera is not None and (difference := summary.cameras[0].unlike([camera], other_pictures)) is not None:
+            warnings.append(f"its pictures are not like {other_pictures}: {difference}")
+    return TraverseAnswer.model_validate(replace(summary, warnings=tuple(warnings)))
 
 
 @router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
-async def delete_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> None:
+def delete_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> None:
     """Remove a traverse and its frames; the maps made from it stay. A job that needs it is a 409."""
-
-    def delete() -> None:
-        for job in services.catalog.jobs(domain):
-            traverse_names = {job.config.get(role) for role in TRAVERSE_ROLES}
-            if name in traverse_names and not job.state.is_final:
-                raise TraverseInUseError(
-                    f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
-                )
-        services.open_traverses.forget(domain, name)
-        Traverse.delete(services.settings.data_dir, domain, name)
-
-    await run_sync(delete)
+    for job in services.catalog.jobs(domain):
+        traverse_names = {job.config.get(role) for role in TRAVERSE_ROLES}
+        if name in traverse_names and not job.state.is_final:
+            raise TraverseInUseError(
+                f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
+            )
+    services.open_traverses.forget(domain, name)
+    Traverse.delete(services.settings.data_dir, domain, name)
     log.info("traverse deleted", extra={"domain": domain, "traverse": name})
