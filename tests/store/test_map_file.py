@@ -205,7 +205,6 @@ def test_files_that_are_no_maps_are_damaged_maps(path: Path, tmp_path: Path) -> 
         "UPDATE q_value SET body = zeroblob(40)",
         "UPDATE q_value SET shape = '[6000000000, 3]'",
         "INSERT INTO q_value SELECT 1, name, dtype, shape, lowest, step, body FROM q_value",
-        "PRAGMA journal_mode = WAL",
     ],
 )
 def test_altered_maps_are_damaged_maps(path: Path, statement: str) -> None:

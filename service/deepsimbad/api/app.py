@@ -21,6 +21,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import Field
 from starlette.responses import PlainTextResponse
 
+from deepsimbad import release
 from deepsimbad.api import (
     coverage,
     domains,
@@ -54,7 +55,6 @@ from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import EvaluatorConfig, fallback, make_evaluator
 from deepsimbad.jobs.runner import InAnotherProcess, JobRunner, RunJob, job_threads
-from deepsimbad.release import release
 from deepsimbad.settings import MEBIBYTE, Settings
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.durable import service_lock

@@ -27,12 +27,12 @@ from prometheus_client import (
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from deepsimbad import release
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import DeepSimbadError
 from deepsimbad.jobs.runner import REMAP
-from deepsimbad.release import release
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import JobRecord, JobState, MapRecord
 

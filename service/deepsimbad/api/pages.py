@@ -9,8 +9,8 @@ from fastapi import Path as PathParameter
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse
 
+from deepsimbad import release
 from deepsimbad.api.requests import StrictRoute
-from deepsimbad.release import release
 
 router = APIRouter(include_in_schema=False, route_class=StrictRoute)
 

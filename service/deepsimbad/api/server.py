@@ -19,10 +19,10 @@ import uvicorn
 from fastapi import FastAPI
 from threadpoolctl import threadpool_limits
 
+from deepsimbad import release
 from deepsimbad.api.app import create_app
 from deepsimbad.errors import SettingsError, UnavailableError
 from deepsimbad.jobs.child import extras
-from deepsimbad.release import release
 from deepsimbad.settings import Settings
 from deepsimbad.store.layout import catalog_path
 

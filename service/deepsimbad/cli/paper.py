@@ -14,6 +14,7 @@ from typing import Any
 import click
 from rich.table import Table
 
+from deepsimbad import release
 from deepsimbad.cli.experiment import (
     DEFAULT_TOLERANCE_M,
     experiment,
@@ -51,7 +52,6 @@ from deepsimbad.jobs.experiments.paper_report import paper_document
 from deepsimbad.jobs.experiments.vpr import bytes_per_encoding
 from deepsimbad.jobs.fitting import RecordingPictures
 from deepsimbad.jobs.progress import Shares, in_threads
-from deepsimbad.release import release
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.options import open_recording, reading

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 
+from deepsimbad import release
 from deepsimbad.cli.terminal import (
     data_dir_option,
     existing_data_dir,
@@ -18,7 +19,6 @@ from deepsimbad.cli.terminal import (
 )
 from deepsimbad.errors import UnavailableError
 from deepsimbad.jobs.versions import import_map
-from deepsimbad.release import release
 from deepsimbad.store.backup import Inspection, back_up, inspect
 from deepsimbad.store.backup import restore as restore_backup
 from deepsimbad.store.layout import catalog_path, domains_folder

@@ -21,12 +21,12 @@ import numpy as np
 import ray
 from ray.data import ActorPoolStrategy
 
+from deepsimbad import release
 from deepsimbad.errors import UnavailableError
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute
 from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.jobs.build import EncodedBlock, encode_block, places_of_blocks
-from deepsimbad.release import release
 from deepsimbad.store.objects import Objects
 from deepsimbad_client.errors import SourceError
 from deepsimbad_client.recordings import EncodedImage, Frame, Recording

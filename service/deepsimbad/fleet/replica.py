@@ -242,26 +242,19 @@ class Replica:
 
     async def administrator_of(self, domain: str) -> int | None:
         """Number of the administrator that made a domain; None: there is no such domain."""
-
-        def administrator() -> int | None:
-            try:
-                return cast("SharedCatalog", self._services.catalog).administrator_of(domain)
-            except UnknownDomainError:
-                return None
-
-        return await asyncio.to_thread(administrator)
+        catalog = cast("SharedCatalog", self._services.catalog)
+        try:
+            return await asyncio.to_thread(catalog.administrator_of, domain)
+        except UnknownDomainError:
+            return None
 
     async def has_job(self, job_id: str) -> bool:
         """Whether a job is in this administrator's catalog."""
-
-        def is_known() -> bool:
-            try:
-                self._services.catalog.job(job_id)
-            except UnknownJobError:
-                return False
-            return True
-
-        return await asyncio.to_thread(is_known)
+        try:
+            await asyncio.to_thread(self._services.catalog.job, job_id)
+        except UnknownJobError:
+            return False
+        return True
 
     async def jobs(self, last_key: int | None, limit: int) -> list[tuple[int, JobRecord]]:
         """As `Catalog.numbered_jobs`, of all domains."""

@@ -30,7 +30,6 @@ from deepsimbad.store.records import MapRecord, from_json, to_json
 from deepsimbad_migrations.map.migrations import migrations
 
 _AS_JSON = frozenset({"config", "evaluator", "actions_m", "metrics"})  # columns of `map`
-_WAL_HEADER = bytes([2, 2])  # read and write version at offset 18 of a file that may have a write-ahead log
 _PAGE_SIZES = (65536, 32768, 16384, 8192, 4096, 2048, 1024, 512)
 _ROW_OVERHEAD = 12  # cell pointer, cell and record headers, the number of a block
 _WORTH_SMALLER_PAGES = 1.01  # of the index's bytes: with small pages all else takes more of them
@@ -162,15 +161,11 @@ def _open_map(path: Path) -> Iterator[Database]:
     if not path.is_file():
         raise DamagedMapError(f"{path.name} is missing", file=path.name)
     try:
-        with storage_faults(path, DamagedMapError):
-            with path.open("rb") as stream:
-                if stream.read(20)[18:] == _WAL_HEADER:  # its newest rows may lie beside it
-                    raise DamagedMapError(f"{path.name} was opened for writing after it was sealed", file=path.name)
-            with open_database(path, immutable=True) as db:
-                if not db.table_names():
-                    raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
-                with in_todays_schema(db, migrations, path) as current_db:
-                    yield current_db
+        with storage_faults(path, DamagedMapError), open_database(path, immutable=True) as db:
+            if not db.table_names():
+                raise DamagedMapError(f"{path.name} is damaged: it is empty", file=path.name)
+            with in_todays_schema(db, migrations, path) as current_db:
+                yield current_db
     except DamagedFileError as error:
         raise DamagedMapError(error.message, **error.hints) from error
 

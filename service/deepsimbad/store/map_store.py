@@ -123,15 +123,15 @@ class MapStore:
         """Read the objects of maps whole; answers what is wrong with them."""
         findings = []
         for n_read, sha256 in enumerate(digests, start=1):
-            digest, problem = hashlib.sha256(), None
+            digest = hashlib.sha256()
             try:
                 for piece in self.map_pieces(sha256):
                     digest.update(piece)
             except DamagedMapError:
                 problem = "is missing"
             else:
-                problem = None if digest.hexdigest() == sha256 else "is another file: its SHA-256 differs"
-            if problem is not None:
+                problem = "" if digest.hexdigest() == sha256 else "is another file: its SHA-256 differs"
+            if problem:
                 findings.append(Finding(f"{self.url}/{_map_name(sha256)}", problem))
             on_progress(n_read / len(digests))
         return findings
