@@ -67,8 +67,7 @@ def running(settings: Settings, n_replicas=2, make_run_job=None, n_administrator
     try:
         with warnings.catch_warnings(action="ignore"):
             cluster()
-            encoders = application.Encoders(1)
-            fleet = application.build(settings, n_replicas, make_run_job, encoders, n_administrators)
+            fleet = application.build(settings, n_replicas, make_run_job, 1, n_administrators=n_administrators)
             front = application.start(fleet, name)
             address = front.address.remote().result()
         yield Fleet(name, address)

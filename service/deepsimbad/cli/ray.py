@@ -124,8 +124,7 @@ def serve(
 
     os.environ.setdefault("RAY_worker_niceness", "0")  # robots wait: Ray's own, 15, leaves processors to all else
     join_cluster(address)
-    encoder_processes = application.Encoders(encoders, encoder_gpus)
-    fleet = application.build(settings, replicas, encoders=encoder_processes, n_administrators=administrators)
+    fleet = application.build(settings, replicas, None, encoders, encoder_gpus, administrators)
     front = application.start(fleet)
     click.echo("ready at http://{}:{}".format(*front.address.remote().result()), err=True)
     application.wait()

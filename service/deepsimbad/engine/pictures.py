@@ -29,7 +29,7 @@ class Pictures:
 
     def keep(self, domain: str, frames: Iterable[tuple[int, bytes]]) -> None:
         """Keep small pictures of frames, given as digest and file; a file that is no image is passed over."""
-        with self._open(domain, create=True) as file:
+        with Thumbnails.open(self._data_dir, domain, create=True) as file:
             for frame_digest, body in frames:
                 if (picture := thumbnail(body, self._max_pixels)) is not None:
                     file.put(frame_digest, picture)
@@ -38,13 +38,13 @@ class Pictures:
         """The JPEG of a map image or a landmark, by the digests of all of them; raises UnknownThumbnailError."""
         if digests is None or number >= digests.size:
             raise UnknownThumbnailError(f"map {snapshot.version} of domain {snapshot.domain} has no picture {number}")
-        with self._open(snapshot.domain) as file:
+        with Thumbnails.open(self._data_dir, snapshot.domain) as file:
             return file.get(int(digests[number]))
 
     def n_bytes(self, domain: str) -> int:
         """The bytes of all small pictures of a domain."""
         try:
-            with self._open(domain) as file:
+            with Thumbnails.open(self._data_dir, domain) as file:
                 return file.n_bytes
         except UnknownThumbnailError:
             return 0
@@ -61,11 +61,3 @@ class Pictures:
         """A small JPEG of a session's last view; None where it is not held."""
         body = self._views.get(session_id)
         return None if body is None else thumbnail(body, self._max_pixels, _VIEW_HEIGHT)
-
-    def _open(self, domain: str, *, create: bool = False) -> Thumbnails:
-        file = Thumbnails.open(self._data_dir, domain, create=create)
-        if file is None:
-            raise UnknownThumbnailError(
-                f"domain {domain} keeps no pictures: PUT it with thumbnails: true, and map anew"
-            )
-        return file

@@ -56,11 +56,6 @@ class OpenTraverses:
                 self._drop(oldest_key)
         try:
             yield loan.traverse
-        except UnknownTraverseError:  # another process deleted it under us
-            with self._lock:
-                if self._open.get(key) is loan:
-                    self._drop(key)
-            raise
         finally:
             with self._lock:
                 loan.n_users -= 1

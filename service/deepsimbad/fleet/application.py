@@ -1,7 +1,6 @@
 """The fleet as an application of Ray Serve: administrators, replicas that have the domains, the front."""
 
 import signal
-from dataclasses import dataclass
 from typing import Any
 
 from ray import serve
@@ -26,24 +25,12 @@ _DEPLOYMENT: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class Encoders:
-    """How many processes have the networks for all; with none every replica has its own."""
-
-    requested: int | None = None  # None: one where it has a GPU; on processors it costs more than it saves
-    num_gpus: float = 0.0  # share of its machine's GPUs that each of them takes, as Ray counts them
-
-    @property
-    def number(self) -> int:
-        """How many there are."""
-        return int(self.num_gpus > 0) if self.requested is None else self.requested
-
-
 def build(
     settings: Settings,
     n_replicas: int,
     make_run_job: MakeRunJob | None = None,
-    encoders: Encoders = Encoders(),
+    n_encoders: int | None = None,
+    encoder_gpus: float = 0.0,
     n_administrators: int = 1,
 ) -> serve.Application:
     """The fleet as `serve.run` takes it; a part whose process ends is started again.
@@ -52,7 +39,9 @@ def build(
         settings: See `Replica`.
         n_replicas: Processes that have domains.
         make_run_job: See `Replica`.
-        encoders: Processes that have networks.
+        n_encoders: Processes that have the networks for all; 0: every replica has its own. None: one where it has a
+            GPU; on processors it costs more than it saves.
+        encoder_gpus: Share of its machine's GPUs that each of these takes, as Ray counts them.
         n_administrators: Processes that administer, each some of the domains.
     """
     if settings.map_store is None:
@@ -63,9 +52,11 @@ def build(
         )
     replica = serve.deployment(**_DEPLOYMENT)(Replica)
     encoder = None
-    if encoders.number:
-        actor_options = {**_DEPLOYMENT["ray_actor_options"], "num_gpus": encoders.num_gpus}
-        encoder_options = {**_DEPLOYMENT, "num_replicas": encoders.number, "ray_actor_options": actor_options}
+    if n_encoders is None:
+        n_encoders = int(encoder_gpus > 0)
+    if n_encoders:
+        actor_options = {**_DEPLOYMENT["ray_actor_options"], "num_gpus": encoder_gpus}
+        encoder_options = {**_DEPLOYMENT, "num_replicas": n_encoders, "ray_actor_options": actor_options}
         encoder = serve.deployment(**encoder_options)(Encoder).options(name="encoder").bind(settings)
     arguments = settings, n_replicas, n_administrators, encoder
     admin = replica.options(name=administrator_name(0)).bind(*arguments, None, 0, make_run_job)
@@ -94,7 +85,10 @@ def wait() -> None:
 
 def from_yaml(arguments: dict[str, Any]) -> serve.Application:
     """The fleet for `serve deploy serve.yaml`, from options of `deepsimbad ray serve` and any setting by its name."""
-    n_replicas, n_administrators = int(arguments.pop("replicas", 4)), int(arguments.pop("administrators", 1))
-    encoders = Encoders(arguments.pop("encoders", None), float(arguments.pop("encoder_gpus", 0.0)))
-    settings = trace_settings(**arguments).settings
-    return build(settings, n_replicas, encoders=encoders, n_administrators=n_administrators)
+    n_replicas = int(arguments.pop("replicas", 4))
+    numbers: dict[str, Any] = {
+        "n_encoders": arguments.pop("encoders", None),
+        "encoder_gpus": float(arguments.pop("encoder_gpus", 0.0)),
+        "n_administrators": int(arguments.pop("administrators", 1)),
+    }
+    return build(trace_settings(**arguments).settings, n_replicas, **numbers)

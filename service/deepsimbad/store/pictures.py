@@ -97,11 +97,13 @@ class Thumbnails(OpenFile):
     """
 
     @classmethod
-    def open(cls, data_dir: Path, domain: str, *, create: bool = False) -> Self | None:
-        """Open a domain's file; None: there is none, and none is to be made."""
+    def open(cls, data_dir: Path, domain: str, *, create: bool = False) -> Self:
+        """Open a domain's file; raises UnknownThumbnailError where there is none, and none is to be made."""
         path = layout.thumbnails_path(data_dir, domain)
         if not create and not path.is_file():
-            return None
+            raise UnknownThumbnailError(
+                f"domain {domain} keeps no pictures: PUT it with thumbnails: true, and map anew"
+            )
         with storage_faults(path):
             return cls(path, open_working_file(path, migrations, create=create, is_checked=False))
 
