@@ -92,6 +92,7 @@ class Recording:
     grey_levels: GreyLevels | None = None  # by which images of more than 8 bits are shown; None: by each one's own
     n_before_slice: int | None = None  # number of frames before some were chosen; None: these are all
     camera: str | None = None  # name of the camera that took the images
+    folder: Path | None = None  # of the frames' files, where each has its own
     full_recording: "Recording | None" = None  # of whose frames these are a slice; None: these are all
     tolerance_m: float | None = None  # within which papers on this set count a match as true; None: no known set
 
@@ -123,7 +124,7 @@ class Recording:
 
     def stamp(self, frame: Frame) -> str:
         """A text that changes when a frame's image does: its name, and of a file its size and time."""
-        return frame.name
+        return frame.name if self.folder is None else stamp_of(self.folder / frame.name)
 
     def view(self, row: int, input_size: tuple[int, int] | None) -> dict[str, Any]:
         """The view of `frames[row]` as arguments of a client's calls; raises as `image` does."""

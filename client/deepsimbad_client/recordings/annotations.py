@@ -59,9 +59,9 @@ def as_taken(recording: Recording, takes: Collection[str]) -> Recording:
     forms = [form for form in FORMS if form in takes]
     if recording.encodings is not None or not forms or isinstance(recording, AnnotatedRecording):
         return recording
-    folder, annotations = getattr(recording, "folder", None), dict[str, Mapping[str, Any]]()
+    annotations: dict[str, Mapping[str, Any]] = {}
     for form in forms:
-        file = None if folder is None else _file(folder, FORMS[form])
+        file = None if recording.folder is None else _file(recording.folder, FORMS[form])
         if file is not None:
             annotations[form] = _read(file, form)
     if not annotations and "image" in takes:

@@ -38,7 +38,7 @@ from deepsimbad_client.recordings import (
 from deepsimbad_client.recordings.folder import shape_in, shape_remarks
 from deepsimbad_client.recordings.gps import GPS_DEADBAND_M, utm
 from deepsimbad_client.recordings.placing import Placement, place_on_track
-from deepsimbad_client.recordings.track import DEADBAND_M, Track, track_of
+from deepsimbad_client.recordings.track import track_of
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -308,17 +308,13 @@ def _place(message: Any, kind: str) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, heading
 
 
-def _track(rows: _Rows, kind: str) -> Track | None:
-    columns = np.array(rows, np.float64).reshape(-1, 4)
-    time_us = np.array([row[0] for row in rows], np.int64)
-    x_m, y_m, heading_rad = columns[:, 1], columns[:, 2], columns[:, 3]
-    if kind == _FIX:
-        return track_of(time_us, *utm(x_m, y_m), deadband_m=GPS_DEADBAND_M)
-    return track_of(time_us, x_m, y_m, heading_rad, deadband_m=DEADBAND_M)
-
-
 def _place_images(images: list[tuple[str, int]], rows: _Rows, kind: str, source: str) -> Placement:
-    track = _track(rows, kind)
+    time_us = np.array([row[0] for row in rows], np.int64)
+    x_m, y_m, heading_rad = np.array(rows, np.float64).reshape(-1, 4)[:, 1:].T
+    if kind == _FIX:
+        track = track_of(time_us, *utm(x_m, y_m), deadband_m=GPS_DEADBAND_M)
+    else:
+        track = track_of(time_us, x_m, y_m, heading_rad)
     if track is None:
         raise SourceError(f"{source}: fewer than two positions can be used")
     placement = place_on_track(track, images, source)

@@ -26,7 +26,6 @@ from deepsimbad_client.recordings import (
     ready,
     require_heic,
     spread,
-    stamp_of,
     with_grey_levels,
 )
 from deepsimbad_client.recordings.annotations import CAPTIONS
@@ -48,10 +47,6 @@ class FolderRecording(Recording):
 
     folder: Path
     rotate: int = 0  # degrees clockwise by which images are turned
-
-    def stamp(self, frame: Frame) -> str:
-        """The stamp of the frame's file; see `Recording.stamp`."""
-        return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame; see `Recording.image`."""

@@ -18,17 +18,15 @@ the track, which do not grow while the robot stands: see `arc_length_m`.
 
 import re
 import warnings
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.frames import NCLT_STORED_SIZE, UPRIGHT_TURN, Camera
+from deepsimbad.core.frames import UPRIGHT_TURN, Camera
 from deepsimbad_client.errors import BrokenFrameError, SourceError
 from deepsimbad_client.recordings import (
     IMAGE_SUFFIXES,
@@ -39,39 +37,18 @@ from deepsimbad_client.recordings import (
     as_png,
     decode,
     read_file,
-    stamp_of,
     turned,
 )
 from deepsimbad_client.recordings.placing import place_on_track
 from deepsimbad_client.recordings.track import Reals, Track, track_of
 
 FRONT_CAMERA = 5
-N_CAMERAS = 6
-
-N_SIZE_PROBES = 9
 TURNED_UPRIGHT = f"NCLT's images, which lie on their side as stored, are turned upright ({UPRIGHT_TURN} degrees)"
 N_COLUMNS = 7
 
 TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
 _CAMERA = re.compile(r"Cam[0-5].*")
 _UTIME = re.compile(r"[0-9]{16}")
-
-
-@dataclass(frozen=True, eq=False)
-class UndistortionMap:
-    """Where each pixel of the undistorted image lies in the stored one."""
-
-    u: NDArray[np.float32]  # [height, width] column in the stored image
-    v: NDArray[np.float32]  # [height, width] row in the stored image
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the images it is for, as stored."""
-        return self.u.shape[1], self.u.shape[0]
-
-    def apply(self, stored: Image) -> Image:
-        """Undistort an image in its stored orientation; what the camera did not see becomes black."""
-        return np.asarray(cv2.remap(stored, self.u, self.v, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,13 +60,8 @@ class NcltRecording(Recording):
     """
 
     folder: Path  # the camera's
-    probes: Sequence[str]  # file names of a few frames spread over the drive
-    undistortion: UndistortionMap | None = None  # applied before an image is turned upright
+    undistortion: NDArray[np.float32] | None = None  # as `read_undistortion`; applied before an image is turned upright
     rotate: int | None = None  # degrees clockwise; None: upright; copies higher than wide are upright already
-
-    def stamp(self, frame: Frame) -> str:
-        """The stamp of the frame's file; see `Recording.stamp`."""
-        return stamp_of(self.folder / frame.name)
 
     def image(self, frame: Frame, input_size: tuple[int, int] | None) -> EncodedImage:
         """Read a frame upright, no larger than asked, as PNG; see `Recording.image`."""
@@ -97,38 +69,17 @@ class NcltRecording(Recording):
 
     def upright(self, frame: Frame) -> Image:
         """Read a frame, undistorted where asked, turned upright; raises BrokenFrameError."""
-        stored = self._stored_image(frame.name)
-        size, expected = (stored.shape[1], stored.shape[0]), self.stored_size
-        if size != expected:
-            raise BrokenFrameError(
-                f"{self.folder / frame.name} is {size[0]} x {size[1]}, the recording's images are "
-                f"{expected[0]} x {expected[1]}",
-                "wrong size",
-            )
+        path = self.folder / frame.name
+        stored = decode(read_file(path), path, as_stored=True)
+        height, width = stored.shape[:2]
         if self.undistortion is not None:
-            stored = self.undistortion.apply(stored)
-        turn = (UPRIGHT_TURN if expected[0] > expected[1] else 0) if self.rotate is None else self.rotate
+            column, row = self.undistortion
+            if column.shape != (height, width):
+                sizes = f"{width} x {height}, the undistortion table of {column.shape[1]} x {column.shape[0]}"
+                raise BrokenFrameError(f"{path} is {sizes}", "wrong size")
+            stored = np.asarray(cv2.remap(stored, column, row, cv2.INTER_LINEAR), dtype=np.uint8)
+        turn = (UPRIGHT_TURN if width > height else 0) if self.rotate is None else self.rotate
         return turned(stored, turn)
-
-    @cached_property
-    def stored_size(self) -> tuple[int, int]:
-        """(width, height) of this recording's images as stored: the undistortion table's, or that of most probes."""
-        if self.undistortion is not None:
-            return self.undistortion.size
-        sizes: Counter[tuple[int, int]] = Counter()
-        for name in self.probes:
-            try:
-                image = self._stored_image(name)
-            except BrokenFrameError:
-                continue
-            sizes[image.shape[1], image.shape[0]] += 1
-        n_most = max(sizes.values(), default=0)
-        commonest = [size for size, n in sizes.items() if n == n_most]
-        return commonest[0] if commonest and NCLT_STORED_SIZE not in commonest else NCLT_STORED_SIZE
-
-    def _stored_image(self, name: str) -> Image:
-        path = self.folder / name
-        return decode(read_file(path), path, as_stored=True)
 
 
 def lies_on_its_side(path: Path) -> bool:
@@ -161,8 +112,6 @@ def read_nclt(
     `U2D_Cam<k>_*.txt` or the folder of them; None: images stay as the lens made them. Raises SourceError (no images, no
     ground truth, or no image that has ground truth).
     """
-    if not 0 <= camera < N_CAMERAS:
-        raise SourceError(f"camera {camera}: NCLT has cameras 0 to {N_CAMERAS - 1}; 5 looks forward")
     if folder is None:
         places = [parent / date / "lb3" / f"Cam{camera}" for parent in (root, root / "images")]
         for parent in (root, root / "images"):
@@ -180,14 +129,12 @@ def read_nclt(
         f"missing in Cam{camera}": _missing_names(folder, names),
         "file name is not a time": not_times,
     }
-    probe_rows = np.unique(np.linspace(0, len(placement.frames) - 1, N_SIZE_PROBES).round().astype(int))
     return NcltRecording(
         name=date,
         frames=tuple(placement.frames),
         left_out_names={reason: files for reason, files in left_out.items() if files},
         remarks=placement.remarks,
         folder=folder,
-        probes=[placement.frames[place].name for place in probe_rows],
         undistortion=None if undistortion is None else read_undistortion(undistortion, camera),
         rotate=rotate,
         camera=f"Cam{camera}",
@@ -239,10 +186,11 @@ def _missing_names(folder: Path, names: Mapping[int, str]) -> list[str]:
     return [other_names[time] for time in sorted(other_names.keys() - names.keys())]
 
 
-def read_undistortion(path: Path, camera: int) -> UndistortionMap:
+def read_undistortion(path: Path, camera: int) -> NDArray[np.float32]:
     """Read a table, `path` itself or the camera's own in the folder `path`; raises SourceError.
 
-    The order of its lines does not matter, for each names its pixel; they must form a complete grid.
+    The order of its lines does not matter, for each names its pixel; they must form a complete grid. Returns
+    [2, height, width] column and row where each pixel of the undistorted image lies in the stored one.
     """
     if path.is_dir():
         tables = sorted(path.glob(f"U2D_Cam{camera}_*.txt"))
@@ -264,9 +212,9 @@ def read_undistortion(path: Path, camera: int) -> UndistortionMap:
     width, height = int(column.max()) + 1, int(row.max()) + 1
     if len(np.unique(row * width + column)) != width * height:
         raise SourceError(f"{path}: {len(pixels)} pixels are not the whole of a table of {width} x {height}")
-    u, v = np.empty((2, height, width), dtype=np.float32)
-    v[row, column], u[row, column] = pixels[:, 2], pixels[:, 3]
-    return UndistortionMap(u=u, v=v)
+    table = np.empty((2, height, width), dtype=np.float32)
+    table[:, row, column] = pixels[:, [3, 2]].T
+    return table
 
 
 def read_ground_truth(path: Path) -> Track:

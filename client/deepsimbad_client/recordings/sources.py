@@ -35,7 +35,7 @@ from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA,
 from deepsimbad_client.recordings.benchmarks import open_benchmark, open_recognised
 from deepsimbad_client.recordings.folder import read_folder
 from deepsimbad_client.recordings.names import counted_anew, dates_in
-from deepsimbad_client.recordings.nclt import FRONT_CAMERA, NcltRecording, ground_truth_files, read_nclt
+from deepsimbad_client.recordings.nclt import NcltRecording, ground_truth_files, read_nclt
 from deepsimbad_client.recordings.positions import positions_file
 from deepsimbad_client.recordings.video import VIDEO_SUFFIXES, read_video
 
@@ -52,7 +52,6 @@ def open_source(
     source: str,
     *,
     spacing_m: float = 1.0,
-    camera: int = FRONT_CAMERA,
     undistortion: Path | None = None,
     rotate: int | None = None,
     time_offset_s: float = 0.0,
@@ -66,7 +65,6 @@ def open_source(
     Args:
         source: SOURCE, see the top of this module.
         spacing_m: Metres between frames where the recording states no positions.
-        camera: NCLT's, 0..5.
         undistortion: NCLT's table, or the folder of them.
         rotate: Degrees clockwise, 0, 90, 180 or 270, by which images are turned; None: NCLT's upright, others not.
         time_offset_s: Added to the images' times before they are looked up on a track.
@@ -86,7 +84,7 @@ def open_source(
     if rotate is not None and rotate not in TURNS:
         raise SourceError(f"images cannot be turned by {rotate} degrees: give 0, 90, 180 or 270")
     place, part = split_slice(source)
-    options = _Options(spacing_m, camera, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
+    options = _Options(spacing_m, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
     recording = _open_whole(place, options)
     _check_options(recording, options)
     first, last = recording.frames[0], recording.frames[-1]
@@ -108,7 +106,6 @@ class _Options:
     """The options of `open_source` that readers take."""
 
     spacing_m: float
-    camera: int
     undistortion: Path | None
     rotate: int | None
     time_offset_us: int
@@ -149,9 +146,7 @@ def _open_whole(place: str, options: _Options) -> Recording:
         drive = Path(place.removeprefix(NCLT_PREFIX)).expanduser()
         if not drive.name or drive.name == "..":
             raise SourceError(f"{place}: expected nclt:ROOT/DATE, for example nclt:/data/nclt/2012-01-22")
-        return read_nclt(
-            drive.parent, drive.name, camera=options.camera, undistortion=options.undistortion, rotate=options.rotate
-        )
+        return read_nclt(drive.parent, drive.name, undistortion=options.undistortion, rotate=options.rotate)
     if (benchmark := open_benchmark(place, options.spacing_m, options.rotate or 0)) is not None:
         return benchmark
     bag, _, topics = place.partition("#")
