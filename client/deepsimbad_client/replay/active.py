@@ -99,7 +99,7 @@ def active_replay(
     seed: int = 0,
     restart: bool = False,
     viewers: Sequence[Viewer] = (),
-    on_progress: Callable[[Episode, int], None] | None = None,
+    on_progress: Callable[[Episode, int], None] = lambda *_: None,
 ) -> ActiveReplay:
     """Drive episodes from random starts, for planners that are to be compared.
 
@@ -126,15 +126,13 @@ def active_replay(
         def drive(key: tuple[str, int]) -> Episode:
             return stage.drive(*key, *starts[key[1]], steps)
 
-        if on_progress is not None:
-            for n_done, key in enumerate(earlier_keys, 1):
-                on_progress(episode_of[key], n_done)
+        for n_done, key in enumerate(earlier_keys, 1):
+            on_progress(episode_of[key], n_done)
         open_keys = [key for key in keys if key not in episode_of]
         for n_done, (key, episode) in enumerate(in_order(drive, open_keys, concurrency), len(earlier_keys) + 1):
             journal.append(asdict(episode))
             episode_of[key] = episode
-            if on_progress is not None:
-                on_progress(episode, n_done)
+            on_progress(episode, n_done)
         if client.domain(domain).map_version != stage.scene.domain.map_version:
             raise changed_map(domain)
     by_planner = {name: [episode_of[name, number] for number in range(episodes)] for name in planners}

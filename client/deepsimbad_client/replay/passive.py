@@ -75,7 +75,7 @@ def replay(
     restart: bool = False,
     allow_missing: bool = True,
     viewers: Sequence[Viewer] = (),
-    on_progress: Callable[[Step, int], None] | None = None,
+    on_progress: Callable[[Step, int], None] = lambda *_: None,
 ) -> Replay:
     """Ask the service for the place of every frame in order, in one session, and compare with the truth.
 
@@ -113,9 +113,7 @@ class _Drive:
         steps: The steps so far, in order; the last few still without their ranks.
     """
 
-    def __init__(
-        self, scene: Scene, journal: Journal[_Record], on_progress: Callable[[Step, int], None] | None
-    ) -> None:
+    def __init__(self, scene: Scene, journal: Journal[_Record], on_progress: Callable[[Step, int], None]) -> None:
         self._scene = scene
         self._journal = journal
         self._on_progress = on_progress
@@ -200,9 +198,8 @@ class _Drive:
             self.steps[row] = replace(self.steps[row], rank=rank, rank_percent=percent)
 
     def _show(self, end: int) -> None:
-        if self._on_progress is not None:
-            for row in range(self._n_shown, end):
-                self._on_progress(self.steps[row], row + 1)
+        for row in range(self._n_shown, end):
+            self._on_progress(self.steps[row], row + 1)
         self._n_shown = end
 
     def end(self) -> None:

@@ -5,6 +5,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from deepsimbad.core.metrics import mean_interval
 from deepsimbad_client.replay import DEFAULT_PLANNER
 from deepsimbad_client.replay.active import ActiveReplay, Episode
 from deepsimbad_client.replay.passive import Replay
 
 NEAR_M = (5.0, 10.0)
-N_RESAMPLES = 2000
-_TAILS = (2.5, 97.5)
 _DIGITS = 4
 
 Reals = NDArray[np.float64]
@@ -99,29 +99,12 @@ def table(summary: dict[str, Any]) -> Table:
     return rows
 
 
-class Resampling:
-    """Bootstrap: the same episodes drawn again with replacement, for every planner alike (paired by start)."""
-
-    def __init__(self, n_episodes: int, seed: int = 0) -> None:
-        rng = np.random.default_rng([seed, n_episodes])
-        share = np.full(n_episodes, 1 / n_episodes)
-        self.times = rng.multinomial(n_episodes, share, size=N_RESAMPLES).astype(np.float64)
-
-    def interval(self, values: Reals, baseline: Reals | None = None) -> list[float] | None:
-        """The 95 % interval of the mean of `values` [e, ...], or of that mean less the `baseline`'s; None: unknown.
-
-        NaN is unknown; a resample without a known value does not count.
-        """
-        means = self._means(values) if baseline is None else self._means(values) - self._means(baseline)
-        means = means[np.isfinite(means)]
-        return [round(float(end), _DIGITS) for end in np.percentile(means, _TAILS)] if means.size else None
-
-    def _means(self, values: Reals) -> Reals:
-        rows = values.reshape(len(values), -1)
-        is_known = np.isfinite(rows)
-        sums = self.times @ np.where(is_known, rows, 0.0).sum(1)
-        counts = self.times @ is_known.sum(1)
-        return np.asarray(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0))
+def interval_95(values: Reals, seed: int = 0) -> list[float] | None:
+    """The 95 % interval of the mean of `values` [e, ...] over resampled episodes; NaN is unknown, None: all are."""
+    is_known, episode = np.isfinite(values), np.indices(values.shape)[0]
+    if not is_known.any():
+        return None
+    return [round(end, _DIGITS) for end in mean_interval(values[is_known], seed, episode[is_known])]
 
 
 def figures(episodes: Sequence[Episode], name: str) -> Reals:
@@ -133,35 +116,35 @@ def summarise_active(replay: ActiveReplay) -> dict[str, Any]:
     """Figures of an active replay, JSON-ready; a figure without a frame to count is None.
 
     `anr` is in percent over all frames after each action, the first view left out; `against` holds the first planner's
-    `anr` less each other's: below 0 the first is better.
+    `anr` less each other's, and the interval of that where both know the rank: below 0 the first is better.
     """
     first, *other_planners = replay.planners
-    resampling = Resampling(len(replay.episodes[first]), int(replay.identity["seed"]))
+    interval = partial(interval_95, seed=int(replay.identity["seed"]))
 
     def of_planners(figure: Callable[[list[Episode]], Any]) -> dict[str, Any]:
         return {name: figure(episodes) for name, episodes in replay.episodes.items()}
 
     rank_percent = of_planners(lambda episodes: figures(episodes, "rank_percent")[:, 1:])
-    against = {}
-    for name in other_planners:
-        first_ranks, other_ranks = _finite(rank_percent[first]), _finite(rank_percent[name])
-        against[name] = {
-            "anr": _round(first_ranks.mean() - other_ranks.mean()) if first_ranks.size and other_ranks.size else None,
-            "interval_95": resampling.interval(rank_percent[first], rank_percent[name]),
-        }
+    anr: dict[str, Any] = {name: _average(ranks) for name, ranks in rank_percent.items()}
     return {
-        "anr": {name: _mean(ranks) for name, ranks in rank_percent.items()},
-        "interval_95": {name: resampling.interval(ranks) for name, ranks in rank_percent.items()},
-        "against": against,
-        "by_step": of_planners(lambda episodes: _by_step(episodes, resampling)),
-        "travelled_m": of_planners(lambda episodes: _mean(figures(episodes, "travelled_m")[:, -1])),
+        "anr": anr,
+        "interval_95": {name: interval(ranks) for name, ranks in rank_percent.items()},
+        "against": {
+            name: {
+                "anr": None if None in {anr[first], anr[name]} else round(anr[first] - anr[name], _DIGITS),
+                "interval_95": interval(rank_percent[first] - rank_percent[name]),
+            }
+            for name in other_planners
+        },
+        "by_step": of_planners(lambda episodes: _by_step(episodes, interval)),
+        "travelled_m": of_planners(lambda episodes: _average(figures(episodes, "travelled_m")[:, -1])),
         "planner_named": of_planners(lambda episodes: episodes[0].planner_named),
         "n_episodes": len(replay.episodes[first]),
-        "n_frames": {name: _finite(ranks).size for name, ranks in rank_percent.items()},
+        "n_frames": {name: int(np.isfinite(ranks).sum()) for name, ranks in rank_percent.items()},
         "n_left_out": {name: int(np.isnan(ranks).sum()) for name, ranks in rank_percent.items()},
         "n_forgot": of_planners(lambda episodes: int(figures(episodes, "forgot").sum())),
         "n_map_images": replay.identity["n_map_images"],
-        "latency_ms": of_planners(lambda episodes: _middle(figures(episodes, "latency_ms"))),
+        "latency_ms": of_planners(lambda episodes: _average(figures(episodes, "latency_ms"), np.median)),
         "config": dict(replay.identity),
         "seconds": round(replay.seconds, 3),
     }
@@ -212,44 +195,26 @@ def planner_label(name: str, service_name: str) -> str:
     return f"{service_name} (default)" if name == DEFAULT_PLANNER and service_name != DEFAULT_PLANNER else name
 
 
-def _by_step(episodes: Sequence[Episode], resampling: Resampling) -> dict[str, list[Any]]:
+def _by_step(episodes: Sequence[Episode], interval: Callable[[Reals], list[float] | None]) -> dict[str, list[Any]]:
     error_m = figures(episodes, "error_m")
     shares = {near_m: 100 * np.where(np.isfinite(error_m), error_m <= near_m, np.nan) for near_m in NEAR_M}
     figures_with_bands = {"anr": figures(episodes, "rank_percent"), "error": error_m}
     figures_with_bands |= {f"within_{near_m:g}_m": share for near_m, share in shares.items()}
     by_step: dict[str, list[Any]] = {
-        "travelled_m": _means(figures(episodes, "travelled_m")),
-        "median_error_m": [_middle(column) for column in error_m.T],
-        "entropy_bits": _means(figures(episodes, "entropy_bits")),
+        "travelled_m": list(map(_average, figures(episodes, "travelled_m").T)),
+        "median_error_m": [_average(column, np.median) for column in error_m.T],
+        "entropy_bits": list(map(_average, figures(episodes, "entropy_bits").T)),
     }
     for name, values in figures_with_bands.items():
-        by_step["error_m" if name == "error" else name] = _means(values)
-        by_step[f"{name}_interval_95"] = [resampling.interval(column) for column in values.T]
+        by_step["error_m" if name == "error" else name] = list(map(_average, values.T))
+        by_step[f"{name}_interval_95"] = list(map(interval, values.T))
     return by_step
 
 
-def _means(values: Reals) -> list[float | None]:
-    return [_mean(column) for column in values.T]
-
-
-def _mean(values: Reals) -> float | None:
-    """The mean of the values that are not NaN; None where all are."""
-    finite = _finite(values)
-    return _round(finite.mean()) if finite.size else None
-
-
-def _middle(values: Reals) -> float | None:
-    """The median of the values that are not NaN; None where all are."""
-    finite = _finite(values)
-    return _round(float(np.median(finite))) if finite.size else None
-
-
-def _finite(values: Reals) -> Reals:
-    return values[np.isfinite(values)]
-
-
-def _round(value: float) -> float:
-    return round(float(value), _DIGITS)
+def _average(values: Reals, of: Callable[[Reals], Any] = np.mean) -> float | None:
+    """The mean, or the median, of the values that are not NaN; None where all are."""
+    finite = values[np.isfinite(values)]
+    return round(float(of(finite)), _DIGITS) if finite.size else None
 
 
 def _table(title: str, first: str, headings: Sequence[str], caption: str | None = None) -> Table:

@@ -92,15 +92,12 @@ def _show(state: SessionState, console: Console, live: Live | None) -> None:
         )
         live.update(picture, refresh=True)
         return
-    low, high = belief.credible_95_m
+    belief_text = _belief_text(
+        belief.mode_m, *belief.credible_95_m, belief.entropy_bits, belief.off_route, belief.confident
+    )
     request = "" if state.next_best_view is None else f", asks for {state.next_best_view.action_m:g} m"
     views = "1 view" if state.n_observations == 1 else f"{state.n_observations} views"
-    console.print(
-        f"{views}: likeliest at {belief.mode_m:.1f} m, 95 % within {low:.0f} .. {high:.0f} m, "
-        f"{belief.entropy_bits:.1f} bits of doubt{_lost_text(belief.off_route)}"
-        f"{', confident' if belief.confident else ''}{request}",
-        soft_wrap=True,
-    )
+    console.print(f"{views}: {belief_text}{request}", soft_wrap=True)
 
 
 @contextmanager
@@ -123,15 +120,12 @@ def describe_step(step: EpisodeStep) -> str:
         )
     if step.forgot:
         view_text += " Its belief had no room for that move, so it begins anew."
-    belief_text = (
-        f"It is likeliest at {step.mode_m:.1f} m, 95 % within {step.low_m:.0f} .. {step.high_m:.0f} m, "
-        f"{step.entropy_bits:.1f} bits of doubt{_lost_text(step.off_route)}{', confident' if step.confident else ''}."
-    )
+    belief_text = _belief_text(step.mode_m, step.low_m, step.high_m, step.entropy_bits, step.off_route, step.confident)
     if step.true_route_m is None or step.error_m is None:
         truth_text = "Truly it is where the map knows no place."
     else:
         truth_text = f"Truly it is by {step.true_route_m:.1f} m, on the ground {step.error_m:.1f} m from there."
-    return f"{view_text} {belief_text} {truth_text}{_request_text(step.next_action_m)}"
+    return f"{view_text} It is {belief_text}. {truth_text}{_request_text(step.next_action_m)}"
 
 
 def _request_text(action_m: float | None) -> str:
@@ -142,9 +136,14 @@ def _request_text(action_m: float | None) -> str:
     return f" It asks to see what is {abs(action_m):g} m {'ahead' if action_m > 0 else 'behind'}."
 
 
-def _lost_text(probability: float | None) -> str:
-    """Words for the probability that the robot is off its route or was carried; "" where it is small or unknown."""
-    return "" if probability is None or probability < _LEAST_LOST else f", lost with {100 * probability:.0f} %"
+def _belief_text(
+    mode_m: float, low_m: float, high_m: float, entropy_bits: float, off_route: float | None, confident: bool
+) -> str:
+    lost = "" if off_route is None or off_route < _LEAST_LOST else f", lost with {100 * off_route:.0f} %"
+    return (
+        f"likeliest at {mode_m:.1f} m, 95 % within {low_m:.0f} .. {high_m:.0f} m, {entropy_bits:.1f} bits of doubt"
+        f"{lost}{', confident' if confident else ''}"
+    )
 
 
 def belief_blocks(mass: Sequence[float], width: int) -> str:
