@@ -199,16 +199,9 @@ def test_the_size_is_that_of_the_traverses(catalog, drive):
         assert stages_in(catalog.data_dir, DOMAIN, parameters) == remap_stages(parameters, *size)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        *({"list_length": 0}, {"list_length": 5, "n_landmarks": 4}, {"n_landmarks": 0}, {"n_landmarks": 65_536}),
-        *({"training_episodes": -1}, {"seed": -1}),
-    ],
-)
-def test_contradictions_are_named(wrong):
+def test_contradictions_are_named():
     with pytest.raises(InvalidMapConfigError):
-        RemapConfig("drive", **wrong)
+        RemapConfig("drive", list_length=5, n_landmarks=4)
 
 
 def test_it_survives_its_json_form():

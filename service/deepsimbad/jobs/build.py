@@ -307,16 +307,7 @@ def _composed_in_space(
     camera: Sequence[SeenTwice],
 ) -> Built:
     """`compose_map` where dissimilarities to all fitted landmarks stand for encodings (II-A, decision 0029)."""
-
-    @cache
-    def drive_by_id(drive_id: int) -> Drive:  # two names of one drive stay one
-        return drive_in_space(drives[drive_id], model, evaluator)
-
-    def in_space(drive: Drive) -> Drive:
-        drives[id(drive)] = drive
-        return drive_by_id(id(drive))
-
-    drives: dict[int, Drive] = {}
+    in_space = cache(partial(drive_in_space, model=model, evaluator=evaluator))  # two names of one drive stay one
     map_build = compose_map(
         plan,
         in_space(training),
@@ -356,7 +347,7 @@ def train_nnql(
 
     Args:
         map_: The map; its lists must not have been made with knowledge of the second drive.
-        own: The map's own traverse, measured.
+        map_drive: The map's own traverse, measured.
         second: Another drive of the same route, measured.
         config: The hyperparameters; small maps take fewer episodes than it says.
 

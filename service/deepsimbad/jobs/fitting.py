@@ -119,10 +119,7 @@ class Fitter:
             [r] frames of the candidates, and the fit.
         """
         fitting, key = self._evaluator.fitting, (candidates, n_landmarks, other_drive)
-        if self._last is not None and all(
-            new_part is last_part or (new_part == last_part and isinstance(new_part, int))
-            for new_part, last_part in zip(key, self._last[0], strict=True)
-        ):
+        if self._last is not None and self._last[0] == key:  # drives are equal to themselves alone
             return self._last[1]
         selection_share = 1.0 if fitting is Fitting.NOTHING else _VIEWS_SHARE
         rows = select_landmarks(candidates.encodings, n_landmarks, lambda share: on_progress(share * selection_share))

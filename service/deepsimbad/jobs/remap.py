@@ -7,7 +7,7 @@ again, and where nothing is fused none is described again, and what two seasons 
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -410,11 +410,7 @@ class _Remap:
 
     def _in_space(self, old_map: Map, drives: KnownDrives, drive: Drive) -> tuple[KnownDrives, Drive]:
         """The drives that a map is made of and the one that joins it, as `drive_in_space`."""
-        by_id = {id(season): season for season in (*drives.seasons, drive, drives.candidates) if season is not None}
-        in_space = {
-            key: drive_in_space(season, old_map.landmark_model, self.evaluator) for key, season in by_id.items()
-        }
-        candidates = None if drives.candidates is None else in_space[id(drives.candidates)]
-        seasons = tuple(in_space[id(season)] for season in drives.seasons)
-        drives = replace(drives, seasons=seasons, candidates=candidates, halves=self.evaluator.halves)
-        return drives, in_space[id(drive)]
+        in_space = cache(partial(drive_in_space, model=old_map.landmark_model, evaluator=self.evaluator))
+        candidates = None if drives.candidates is None else in_space(drives.candidates)
+        seasons = tuple(map(in_space, drives.seasons))
+        return replace(drives, seasons=seasons, candidates=candidates, halves=self.evaluator.halves), in_space(drive)

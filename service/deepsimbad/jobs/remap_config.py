@@ -1,6 +1,5 @@
 """The parameters of a remap, the time that it takes, and what is impossible of it, known before it begins."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import Any, Self
 
 from deepsimbad.core.building import check_list_length
 from deepsimbad.core.composed import is_composed
-from deepsimbad.core.descriptor import MAX_LANDMARKS
 from deepsimbad.core.landmark_model import fitting_number
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
@@ -58,19 +56,13 @@ class RemapConfig:
     camera_of: str | None = None
 
     def __post_init__(self) -> None:
-        n_landmarks = self.n_landmarks
-        if n_landmarks is not None and not 1 <= n_landmarks <= MAX_LANDMARKS:
-            raise InvalidMapConfigError(f"n_landmarks must be within 1 and {MAX_LANDMARKS}", n_landmarks=n_landmarks)
-        if self.list_length < 1 or (n_landmarks is not None and self.list_length > n_landmarks):
+        # What contradicts itself; the range of each parameter is checked where it comes in
+        if self.n_landmarks is not None and self.list_length > self.n_landmarks:
             raise InvalidMapConfigError(
                 f"list_length {self.list_length} must be at least 1 and at most n_landmarks",
                 list_length=self.list_length,
-                n_landmarks=n_landmarks,
+                n_landmarks=self.n_landmarks,
             )
-        if self.training_episodes < 0 or self.seed < 0:
-            raise InvalidMapConfigError("training_episodes and seed must not be negative")
-        if self.gate_margin is not None and not (math.isfinite(self.gate_margin) and self.gate_margin >= 0):
-            raise InvalidMapConfigError("gate_margin is in percentage points of ANR, finite and not negative")
         if self.check_traverse == self.training_traverse:
             raise InvalidMapConfigError(
                 "a map finds the frames it was made of at once: give another check_traverse, or none to hold frames out"

@@ -225,7 +225,8 @@ class JobRunner:
                 _log.error("a job's process died", extra=log_fields)
             elif not is_cancelled:
                 _log.warning("a job failed", extra={**log_fields, "code": error.code})
-            self._write(self._clear_away)
+            for line in self._write(self._catalog.discard_abandoned_maps):  # what a killed process was building
+                _log.info("discarded", extra={"what": line})
             if is_cancelled and not cancellation.is_set():
                 return None
             map_record = self._catalog.map_of_job(job.domain, job.job_id) if is_cancelled or has_died else None
@@ -245,11 +246,6 @@ class JobRunner:
         if result["active"]:
             self._on_activated(job.domain)
         return {"state": JobState.SUCCEEDED, "result": result, "progress": 1.0}
-
-    def _clear_away(self) -> None:
-        """Discard the map that a killed process was building."""
-        for line in self._catalog.discard_abandoned_maps():
-            _log.info("discarded", extra={"what": line})
 
     def _write(self, write: Callable[[], _T]) -> _T:
         """Write to the catalog, again and again until a full disk has room, so that a job's end is noted in the end.

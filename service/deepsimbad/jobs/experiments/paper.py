@@ -185,16 +185,14 @@ class Pair:
         is_scored = np.array([truth.size > 0 for truth in truths[0]])
         ranks = {name: 100 * score.normalised_ranks for name, score in scores[0].items()}
         same_route = map_builds[Relevance.COMPOSED].same_route
+        anr_at, recall = dict[str, Document](), dict[str, Document]()
+        for metres, named_scores in zip(tolerances, scores, strict=True):
+            anr_at[metres] = {name: score.anr for name, score in named_scores.items()}
+            recall[metres] = {name: {str(k): s.recall_at[k] for k in RANKS} for name, s in named_scores.items()}
         return {
-            "anr": {name: score.anr for name, score in scores[0].items()},
-            "anr_at": {
-                m: {name: s.anr for name, s in named_scores.items()}
-                for m, named_scores in zip(tolerances, scores, strict=True)
-            },
-            "recall": {
-                m: {name: {str(k): s.recall_at[k] for k in RANKS} for name, s in named_scores.items()}
-                for m, named_scores in zip(tolerances, scores, strict=True)
-            },
+            "anr": anr_at[tolerances[0]],
+            "anr_at": anr_at,
+            "recall": recall,
             "n_queries": int(is_scored.sum()),
             "n_left_out": int((~is_scored).sum()),
             "blocks": _by_block(ranks, (test.position_m[is_scored] // BLOCK_M).astype(np.int64)),
@@ -213,6 +211,13 @@ class Pair:
         names = [name for name in planner_names(config) if name != CLAIRVOYANT]
         episodes: dict[str, dict[str, list[Episode]]] = {}
         timings_ms = {}
+
+        def by_planner(setup: str, figure: Callable[[list[Episode]], Any]) -> Document:
+            return {name: figure(planner_episodes) for name, planner_episodes in episodes[setup].items()}
+
+        def mean_move_m(planner_episodes: list[Episode]) -> float:
+            return float(np.mean([episode.travelled_m[-1] for episode in planner_episodes]) / config.n_steps)
+
         for place, (name, relevance) in enumerate(SETUPS.items()):
             if name not in self._setups:
                 self._setups[name] = train_setup(config, name, self._map_builds[relevance], lambda _: None)
@@ -230,31 +235,10 @@ class Pair:
             **{part: document[part] for part in ("anr", "anr_paper", "best_constant", "n_episodes")},
             **{part: document[f"{part}_confident"] for part in ("views_to", "metres_to", "wrong_when")},
             "blocks": {
-                **{
-                    setup: _by_block(
-                        {
-                            name: _episode_means(planner_episodes, "rank_share")
-                            for name, planner_episodes in setup_episodes.items()
-                        },
-                        block,
-                    )
-                    for setup, setup_episodes in episodes.items()
-                },
-                "views": _by_block(
-                    {
-                        name: _episode_means(planner_episodes, "views") / 100
-                        for name, planner_episodes in episodes["ours"].items()
-                    },
-                    block,
-                ),
+                **{setup: _by_block(by_planner(setup, _rank_percent), block) for setup in episodes},
+                "views": _by_block(by_planner("ours", lambda runs: [run.views for run in runs]), block),
             },
-            "mean_move_m": {
-                setup: {
-                    name: float(np.mean([episode.travelled_m[-1] for episode in planner_episodes]) / config.n_steps)
-                    for name, planner_episodes in setup_episodes.items()
-                }
-                for setup, setup_episodes in episodes.items()
-            },
+            "mean_move_m": {setup: by_planner(setup, mean_move_m) for setup in episodes},
             "took_ms": timings_ms,
             "evaluations": n_measured * config.n_landmarks,
             "evaluations_s": n_measured / 1000 * timings_ms["paper"]["describe"],
@@ -283,9 +267,9 @@ def _part_of(report: Callable[[float], None], number: int, n_parts: int, share: 
     report((number + share) / n_parts)
 
 
-def _episode_means(episodes: Sequence[Episode], part: str) -> NDArray[np.float64]:
-    """[episodes] mean of a field of an episode, percent."""
-    return np.array([100 * np.mean(getattr(episode, part)) for episode in episodes], np.float64)
+def _rank_percent(episodes: Sequence[Episode]) -> NDArray[np.float64]:
+    """[episodes] mean of the truth's rank over an episode, percent."""
+    return np.array([100 * np.mean(episode.rank_share) for episode in episodes], np.float64)
 
 
 def _by_block(values: Mapping[str, NDArray[np.float64]], block: NDArray[np.int64]) -> Document:
