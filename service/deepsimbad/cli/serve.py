@@ -2,7 +2,6 @@
 
 import gc
 import logging
-import sys
 from datetime import timedelta
 from typing import Any
 
@@ -23,7 +22,7 @@ from deepsimbad.cli.terminal import (
     traced_settings,
     write_json,
 )
-from deepsimbad.errors import DeepSimbadError, UnavailableError, UnknownKeyError
+from deepsimbad.errors import DeepSimbadError, UnknownKeyError
 from deepsimbad.settings import unknown_variables, variable_of
 from deepsimbad.store.catalog import ApiKey, Catalog
 from deepsimbad.store.layout import catalog_path
@@ -136,17 +135,10 @@ def keys() -> None:
 def create(scope: str, name: str, expires_days: float | None, domains: tuple[str, ...]) -> None:
     """Make a key and print it, alone, on standard output. It is shown this once: only a digest is kept."""
     lifetime = None if expires_days is None else timedelta(days=min(expires_days, timedelta.max.days))
-    if sys.stdout is None:
-        raise UnavailableError("standard output is closed: nobody would know the key")
     with Catalog.open(given_settings().data_dir) as catalog:
         is_first = not catalog.keys()
         record, key = catalog.create_key(KeyScope(scope), name, lifetime, domains or None)
-        try:
-            click.echo(key.text)
-        except BaseException:  # nobody has read it, and nobody can again
-            catalog.revoke_key(record.key_id)
-            click.echo(f"key {record.key_id} could not be written, and is revoked", err=True)
-            raise
+    click.echo(key.text)
     expiry = "" if record.expires_at is None else f" until {record.expires_at}"
     scope_domains = f" of {', '.join(domains)}" if domains else ""
     click.echo(

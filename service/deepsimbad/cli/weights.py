@@ -207,20 +207,15 @@ def _rows(lock: Lock) -> Iterator[dict[str, Any]]:
     for weights_ in KNOWN:
         row = _row(lock, weights_.name, weights_.extractor)
         row |= {"licence": weights_.licence, "packages": list(weights_.packages), "page": weights_.page}
-        for name, value in (
-            ("encoding_dim", weights_.encoding_dim),
-            ("input", _size_text(weights_.input_size)),
-            ("size_mb", weights_.size_mb),
-        ):
-            row[name] = row[name] or value
+        row["encoding_dim"] = row["encoding_dim"] or weights_.encoding_dim
+        row["input"] = row["input"] or _size_text(weights_.input_size)
+        row["size_mb"] = row["size_mb"] or weights_.size_mb
         if weights_.package is not None:
             is_there = find_spec(weights_.package.replace("-", "_")) is not None
             row["state"] = "with its package" if is_there else "no package"
         yield row
-    known_files, known_hub = (
-        {known_entry.file for known_entry in KNOWN},
-        {canonical(known_entry.extractor) for known_entry in KNOWN},
-    )
+    known_files = {weights_.file for weights_ in KNOWN}
+    known_hub = {canonical(weights_.extractor) for weights_ in KNOWN}
     yield from (_row(lock, name, file.extractor) for name, file in lock.files.items() if name not in known_files)
     yield from (_row(lock, hub.repository, name) for name, hub in lock.hub.items() if name not in known_hub)
 
