@@ -54,19 +54,12 @@ for command in COMMANDS:
     cli.add_command(command)
 
 
-def resumes(arguments: Sequence[str] | None) -> bool:
-    """Whether the command, given again, goes on where it stopped; `arguments` None: those of the process."""
-    words = sys.argv[1:] if arguments is None else arguments
-    return bool(words) and words[0] in RESUMABLE
-
-
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns its exit code."""
+    """Run the command line, by default that of the process; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
     show_waits()
     try:
-        code = cli.main(
-            None if arguments is None else list(arguments), prog_name="deepsimbad-client", standalone_mode=False
-        )
+        code = cli.main(words, prog_name="deepsimbad-client", standalone_mode=False)
     except DeepSimbadClientError as error:
         one_line = " ".join(str(error).split())
         sys.stderr.write(f"deepsimbad-client: {error.code}: {one_line}\n")
@@ -75,7 +68,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        sys.stderr.write(f"deepsimbad-client: cancelled{GOES_ON if resumes(arguments) else ''}\n")
+        sys.stderr.write(f"deepsimbad-client: cancelled{GOES_ON if RESUMABLE.intersection(words[:1]) else ''}\n")
         return CANCELLED
     except BrokenPipeError:  # the reader of the output has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

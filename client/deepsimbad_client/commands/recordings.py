@@ -251,7 +251,8 @@ def replay(
     folder = out or Path("replays") / f"{domain}-{recording.name}{'-active' if planners else ''}"
     name = f"{recording.name} against {domain}"
     with ExitStack() as open_viewers:
-        viewers = _viewers(rerun, mcap, open_viewers)
+        viewers: list[Viewer] = [open_viewers.enter_context(RerunViewer())] if rerun else []
+        viewers += [] if mcap is None else [open_viewers.enter_context(McapFile(mcap))]
         common: dict[str, Any] = {"concurrency": concurrency, "restart": restart, "viewers": viewers}
         if planners:
             with EpisodeBar(name, len(dict.fromkeys(planners)) * active.get("episodes", EPISODES)) as bar:
@@ -288,16 +289,6 @@ def replay(
     names = recording.left_out_names if planners else passive_result.left_out_names
     tell_left_out(names, recording.name, verbose=verbose)
     REMARKS.print(f"results in {folder}; all on one page: {page}", soft_wrap=True)
-
-
-def _viewers(rerun: bool, mcap: Path | None, open_viewers: ExitStack) -> list[Viewer]:
-    """The viewers of a replay, entered in `open_viewers`; raises MissingExtraError, ReplayError (the file exists)."""
-    viewers: list[Viewer] = []
-    if rerun:
-        viewers.append(open_viewers.enter_context(RerunViewer()))
-    if mcap is not None:
-        viewers.append(open_viewers.enter_context(McapFile(mcap)))
-    return viewers
 
 
 @click.command()

@@ -86,10 +86,13 @@ class AdminCalls(Face):
         Whether pictures are kept (`thumbnails`) and where x = y = 0 lies (`anchor`: `{"lat_deg": ..., "lon_deg": ...}`)
         may be changed later; None leaves it as it is.
         """
-        actions = None if actions_m is None else [float(action) for action in actions_m]
-        document: dict[str, Any] = {"evaluator": dict(evaluator), "closed": closed, "actions_m": actions}
-        document |= {} if thumbnails is None else {"thumbnails": thumbnails}
-        document |= {} if anchor is None else {"anchor": dict(anchor)}
+        document = {
+            "evaluator": dict(evaluator),
+            "closed": closed,
+            "actions_m": None if actions_m is None else [float(action) for action in actions_m],
+            "thumbnails": thumbnails,
+            "anchor": None if anchor is None else dict(anchor),
+        }
         return await self._wire.model(Domain, Call.with_json("PUT", _domain(name), document))
 
     @shared
@@ -313,7 +316,7 @@ class AdminCalls(Face):
 
     @shared
     async def download_map(
-        self, domain: str, version: int, path: str | Path, *, on_progress: OnBytes | None = None
+        self, domain: str, version: int, path: str | Path, *, on_progress: OnBytes = lambda *_: None
     ) -> MapFile:
         """Fetch the sealed file of a version, to keep or to import it elsewhere.
 
@@ -369,7 +372,7 @@ def remap(
     domain: str,
     training_traverse: str,
     *,
-    on_progress: Callable[[Job], None] | None = None,
+    on_progress: Callable[[Job], None] = lambda _: None,
     patience_s: float = PATIENCE_S,
     **options: Unpack[RemapOptions],
 ) -> Job:
@@ -379,36 +382,34 @@ def remap(
     by more than the gate's margin, `active` is false and `check["why"]` says so. The rest is as in `follow_job`.
     """
     job = client.admin.remap(domain, training_traverse=training_traverse, **options)
-    if on_progress is not None:
-        on_progress(job)
+    on_progress(job)
     return follow_job(client, job.job_id, on_progress, patience_s=patience_s)
 
 
 def follow_job(
     client: "Client",
     job_id: str,
-    on_progress: Callable[[Job], None] | None = None,
+    on_progress: Callable[[Job], None] = lambda _: None,
     *,
-    on_silence: Callable[[float], None] | None = None,
+    on_silence: Callable[[float], None] = lambda _: None,
     patience_s: float = PATIENCE_S,
     sleep: Callable[[float], None] = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> Job:
     """Follow a job until it has succeeded, through lost connections and restarted services.
 
-    Listens to its event stream; where that breaks off, asks for the job now and then until the service answers again
-    and listens anew; where there is no stream at all, goes on asking. `on_progress` is called with the job each time it
+    Listens to its event stream; where that breaks off or there is none, asks for the job now and then, and tries to
+    listen anew. `on_progress` is called with the job each time it
     is heard of, `on_silence` with the seconds since then each time the service has not answered. Raises JobFailedError,
     JobCancelledError, TransportError (nothing was heard for `patience_s`; the job itself may go on), ApiError.
     """
-    last_heard_s, wait_s, has_stream = clock(), POLL_S, True
+    last_heard_s, wait_s = clock(), POLL_S
 
     def hear(job: Job) -> bool:
         """Report a job just heard of, and return whether it succeeded."""
         nonlocal last_heard_s, wait_s
         last_heard_s, wait_s = clock(), POLL_S
-        if on_progress is not None:
-            on_progress(job)
+        on_progress(job)
         if job.state == "cancelled":
             raise JobCancelledError(f"job {job.job_id} was cancelled", job)
         if job.ended and job.state != "succeeded":
@@ -416,21 +417,16 @@ def follow_job(
         return job.ended
 
     while True:
-        try:
-            for job in client.admin.job_events(job_id) if has_stream else ():
+        with suppress(TransportError, ApiError):  # what lasts is raised by the question below
+            for job in client.admin.job_events(job_id):
                 if hear(job):
                     return job
-        except TransportError:
-            pass
-        except ApiError as error:
-            has_stream = _is_passing(error)
         try:
             job = client.admin.job(job_id)
         except (TransportError, ApiError) as error:
             if not _is_passing(error) or clock() - last_heard_s > patience_s:
                 raise
-            if on_silence is not None:
-                on_silence(clock() - last_heard_s)
+            on_silence(clock() - last_heard_s)
             wait_s = min(2 * wait_s, LONGEST_POLL_S)
         else:
             if hear(job):

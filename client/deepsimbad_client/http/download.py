@@ -29,7 +29,7 @@ class MapFile:
     file_bytes: int
 
 
-async def download(wire: Wire, call: Call, path: Path, on_progress: OnBytes | None) -> MapFile:
+async def download(wire: Wire, call: Call, path: Path, on_progress: OnBytes) -> MapFile:
     """Fetch the file that `call` asks for; a try that brings some bytes starts the count of tries anew.
 
     The bytes that have come wait in `<name>.<sha256>.part`: the name tells a later try, in this process or another,
@@ -62,7 +62,7 @@ async def download(wire: Wire, call: Call, path: Path, on_progress: OnBytes | No
     return await wire.link.aside(lambda: _finish(call, part, path))
 
 
-async def _save(wire: Wire, response: httpx2.Response, path: Path, on_progress: OnBytes | None) -> Path:
+async def _save(wire: Wire, response: httpx2.Response, path: Path, on_progress: OnBytes) -> Path:
     """Add an answer's content to the part file that it belongs to, whose path is returned."""
     etag = _ETAG.search(response.headers.get("etag", ""))
     if etag is None:
@@ -83,8 +83,7 @@ async def _save(wire: Wire, response: httpx2.Response, path: Path, on_progress: 
         async for piece in wire.link.pieces(response):
             file.write(piece)
             n_there += len(piece)
-            if on_progress is not None:
-                on_progress(n_there, n_in_all)
+            on_progress(n_there, n_in_all)
         file.flush()
         os.fsync(file.fileno())
     return part

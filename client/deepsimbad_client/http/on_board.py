@@ -170,10 +170,8 @@ class OnBoardEncoder:
         """The encoding of the view, [1, d]; None for an image that shows nothing."""
         if (image is None) == (encoding is None):
             raise InvalidArgumentError("give exactly one of image and encoding")
-        return np.asarray(encoding, np.float32).reshape(1, -1) if image is None else self._of_image(image)
-
-    def _of_image(self, image: "Image | NDArray[np.uint8]") -> NDArray[np.float32] | None:
-        """The encoding of an image, [1, d]; None for one that shows nothing."""
+        if image is None:
+            return np.asarray(encoding, np.float32).reshape(1, -1)
         if not self._evaluator.takes_images:
             raise InvalidArgumentError("the domain has no extractor and takes ready encodings alone: give encoding")
         if isinstance(image, np.ndarray):

@@ -60,7 +60,7 @@ def upload(
     concurrency: int = CONCURRENCY,
     replace: bool = False,
     allow_missing: bool = True,
-    on_progress: Callable[[UploadReport], None] | None = None,
+    on_progress: Callable[[UploadReport], None] = lambda _: None,
 ) -> UploadReport:
     """Send the frames of a recording that the service does not have yet.
 
@@ -81,17 +81,12 @@ def upload(
     stored_traverse = client.admin.create_traverse(domain, traverse, grey_levels=recording.grey_levels)
     recording = recording.shown_by(stored_traverse.grey_levels)
     report = UploadReport(len(recording.frames), left_out=recording.left_out, left_out_names=left_out.names)
-
-    def tell() -> None:
-        if on_progress is not None:
-            on_progress(report)
-
-    tell()
+    on_progress(report)
     stored_columns = client.admin.frames(domain, traverse)
     comparison = Comparison(recording, stored_columns)
     for _ in comparison.read_digests(input_size, concurrency):
         report.n_skipped += 1
-        tell()
+        on_progress(report)
     replaced_rows = comparison.rows_to_replace(f"{domain}/{traverse}", replace=replace)
     _check_unsent(recording, stored_columns, f"{domain}/{traverse}", input_size)
     equal_rows = set(comparison.rows) - replaced_rows
@@ -107,7 +102,7 @@ def upload(
             client.admin.put_frames(domain, traverse, encodings=values, name=names, replace=replace, **columns)
             report.n_sent += len(batch)
             report.bytes_sent += values.nbytes
-            tell()
+            on_progress(report)
     else:
         send = partial(_send_image, client, recording, domain, traverse, input_size, replace)
         for frame, outcome in in_order(send, [recording.frames[row] for row in rows], concurrency):
@@ -118,7 +113,7 @@ def upload(
                 report.n_broken[outcome] += 1
                 report.broken_names.append(frame.name)
                 left_out.add(outcome, frame.name)
-            tell()
+            on_progress(report)
     report.warnings = client.admin.traverse(domain, traverse).warnings
     report.seconds = time.monotonic() - start_s
     if report.n_sent + report.n_skipped == 0:

@@ -89,7 +89,7 @@ QUEUED, RUNNING, SUCCEEDED = job("queued"), job("running", 0.6), job("succeeded"
             [LOST, STARTING, QUEUED],
             [0.2, 0, 0, 0.6, 1],
         ),
-        ([NO_STREAMS], [QUEUED, RUNNING, SUCCEEDED], [0.0, 0.6, 1.0]),
+        ([NO_STREAMS] * 3, [QUEUED, RUNNING, SUCCEEDED], [0.0, 0.6, 1.0]),
         ([PAGE], [SUCCEEDED], [1.0]),
         *(([answer(status), DONE], [answer(status)], [1.0]) for status in (408, 429, 502, 503)),
     ],
