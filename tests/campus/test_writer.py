@@ -107,14 +107,6 @@ def test_a_real_recording_is_never_touched(tmp_path, file):
     assert _files(tmp_path) == {file: b"real"}
 
 
-@pytest.mark.parametrize("text", ["[]", "{", '{"seed": 0}'])
-def test_a_damaged_order_is_named(tmp_path, text):
-    (tmp_path / SUMMER).mkdir()
-    (tmp_path / SUMMER / "campus.json").write_text(text)
-    with pytest.raises(CampusError, match="damaged"):
-        write_campus(tmp_path, ["summer"], 2)
-
-
 @pytest.mark.parametrize("seasons", [[], ["winter", "2012-01-22"], [""], ["Winter"], ["2012-13-01"], ["22.1.2012"]])
 def test_seasons_that_cannot_be_are_refused_before_anything_is_written(tmp_path, seasons):
     with pytest.raises(CampusError):
