@@ -294,12 +294,7 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def localize(
-        self,
-        domain: str,
-        image: Image | None = None,
-        *,
-        shortlist: int | None = None,
-        **view: Unpack[ViewForm],
+        self, domain: str, image: Image | None = None, *, shortlist: int | None = None, **view: Unpack[ViewForm]
     ) -> Localization:
         """Where one view probably is; give exactly one form of it.
 

@@ -226,11 +226,7 @@ def _advice(traverse: str) -> str:
     return f"delete it first (`deepsimbad-client delete-traverse {domain} {name}`) or choose another --traverse"
 
 
-def in_order(
-    work: Callable[[Item], Result],
-    items: Iterable[Item],
-    concurrency: int,
-) -> Iterator[tuple[Item, Result]]:
+def in_order(work: Callable[[Item], Result], items: Iterable[Item], concurrency: int) -> Iterator[tuple[Item, Result]]:
     """Yield (item, work(item)) in the items' order, with at most `concurrency` at work and as many waiting.
 
     The first failure is raised in its turn; what has not begun by then never begins. So it is when the caller stops.

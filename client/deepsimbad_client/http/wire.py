@@ -376,9 +376,7 @@ class Shared(Generic[P, Blocked, Awaited]):
         return function if face is None else function.__get__(face, owner)
 
 
-def shared(
-    awaiting: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]],
-) -> Shared[P, T, Coroutine[Any, Any, T]]:
+def shared(awaiting: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> Shared[P, T, Coroutine[Any, Any, T]]:
     """Make a plain method of a `Blocking` class and a coroutine method of an `Awaiting` one."""
     return Shared(lambda *args, **kwargs: run_to_end(awaiting(*args, **kwargs)), awaiting)
 

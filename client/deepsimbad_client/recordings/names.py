@@ -174,13 +174,7 @@ def _fold(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-_KEYS: tuple[Callable[[str], Hashable], ...] = (
-    lambda name: name,
-    _fold,
-    stem,
-    lambda name: stem(_fold(name)),
-    _number,
-)
+_KEYS: tuple[Callable[[str], Hashable], ...] = (lambda name: name, _fold, stem, lambda name: stem(_fold(name)), _number)
 
 
 def _unambiguous(names: Sequence[str], key: Callable[[str], Hashable]) -> dict[Hashable, str]:

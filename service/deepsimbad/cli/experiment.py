@@ -151,14 +151,7 @@ def vpr(
             landmarks, training, test = triplet.drives
             truth = true_images(test, training, tolerance_m, ground_truth)
             report = run_vpr(
-                config,
-                triplet.evaluator,
-                landmarks,
-                training,
-                triplet.test,
-                truth,
-                progress,
-                triplet.pictures,
+                config, triplet.evaluator, landmarks, training, triplet.test, truth, progress, triplet.pictures
             )
         sources = {**triplet.sources, "ground_truth": None if ground_truth is None else str(ground_truth)}
         documents[extractor] = {**report.as_dict(sources), "warnings": [*triplet.warnings, *report.warnings]}

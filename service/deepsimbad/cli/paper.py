@@ -25,13 +25,7 @@ from deepsimbad.cli.experiment import (
 )
 from deepsimbad.cli.local import seed_option, training_episodes_option
 from deepsimbad.cli.paper_page import write_report
-from deepsimbad.cli.terminal import (
-    data_dir_option,
-    evaluator_option,
-    given_settings,
-    print_table,
-    progress_bar,
-)
+from deepsimbad.cli.terminal import data_dir_option, evaluator_option, given_settings, print_table, progress_bar
 from deepsimbad.core.composed import MOST_DIMENSIONS
 from deepsimbad.core.drive import Drive
 from deepsimbad.errors import InvalidSourceError

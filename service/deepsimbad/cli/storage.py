@@ -71,13 +71,7 @@ def export(domain: str, file: Path, version: int | None, as_json: bool) -> None:
     with open_given_catalog() as catalog:
         record = export_map(catalog, domain, version, file)
     n_bytes, digest = record.file_bytes, record.sha256
-    document = {
-        "domain": domain,
-        "map_version": record.version,
-        "file": str(file),
-        "bytes": n_bytes,
-        "sha256": digest,
-    }
+    document = {"domain": domain, "map_version": record.version, "file": str(file), "bytes": n_bytes, "sha256": digest}
     report(as_json, document, f"map {record.version} of {domain} is in {file}: {n_bytes} bytes, sha256 {digest}")
 
 

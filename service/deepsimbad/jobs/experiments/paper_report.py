@@ -122,13 +122,7 @@ def _mean_of(documents: Sequence[Any]) -> Any:
 
 
 def _judge(
-    claim: str,
-    pooled: PooledFigures,
-    name: str,
-    rival: str,
-    is_less: Sequence[bool],
-    seed: int,
-    said_by: str = "paper",
+    claim: str, pooled: PooledFigures, name: str, rival: str, is_less: Sequence[bool], seed: int, said_by: str = "paper"
 ) -> Document:
     """A claim that one method's figure is less than another's; whether it is so in every triplet."""
     difference = pooled.difference(name, rival, seed)
