@@ -6,7 +6,7 @@ import random
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Generic, TypedDict, TypeVar, Unpack
 
 import httpx2
 
@@ -61,6 +61,17 @@ if TYPE_CHECKING:
     from deepsimbad_client.http.on_board import OnBoardEncoder
 
 AnySession = TypeVar("AnySession", bound="SessionCalls")
+
+
+class SessionOptions(TypedDict, total=False):
+    """The options of a session; one that is absent or None is left to the service's default."""
+
+    seed: int | None  # of all that is drawn at random
+    planner: str | None  # who chooses the next view: informed, nnql, random, constant:3, ...
+    belief: str | None  # particle or grid
+    update: str | None  # how a view changes the belief
+    confidence: float | None  # mass within 5 m of the likeliest place from which on the robot may stop
+    price_bits_per_m: float | None  # what a metre costs `informed`; other planners refuse it
 
 
 class SessionCalls(Face):
@@ -348,14 +359,9 @@ class ClientCalls(Face, Generic[AnySession]):
         start_position_m: float | None = None,
         start_std_m: float | None = None,
         *,
-        seed: int | None = None,
-        planner: str | None = None,
-        belief: str | None = None,
-        update: str | None = None,
-        confidence: float | None = None,
-        price_bits_per_m: float | None = None,
         keep: bool = False,
         idempotency_key: str | None = None,
+        **options: Unpack[SessionOptions],
     ) -> AnySession:
         """Begin a session: the service keeps this robot's belief from view to view.
 
@@ -363,23 +369,11 @@ class ClientCalls(Face, Generic[AnySession]):
         answer is asked for again and begins no second session.
 
         `start_position_m` is about where it starts along the route (absent: anywhere), `start_std_m` how well
-        that is known. The `planner` chooses the next view (`informed`, `nnql`, `random`, `constant:3`, ...), `belief`
-        is `particle` or `grid`, `update` says how a view changes it, `seed` all that is drawn at random. With mass of
-        `confidence` within 5 m of the likeliest place the robot may stop; `price_bits_per_m` is what a metre costs
-        `informed`; other planners refuse it. What is absent is the service's default. With `keep` it outlives its
-        `with` block. The `idempotency_key` names this beginning, so that it can be repeated after a `TransportError`.
-        Raises UnknownDomainError, NoActiveMapError, InvalidPriorError, TooManySessionsError.
+        that is known; `options` are the `SessionOptions`. With `keep` it outlives its `with` block. The
+        `idempotency_key` names this beginning, so that it can be repeated after a `TransportError`. Raises
+        UnknownDomainError, NoActiveMapError, InvalidPriorError, TooManySessionsError.
         """
-        document = {
-            "start_position_m": start_position_m,
-            "start_std_m": start_std_m,
-            "seed": seed,
-            "planner": planner,
-            "belief": belief,
-            "update": update,
-            "confidence": confidence,
-            "price_bits_per_m": price_bits_per_m,
-        }
+        document = {"start_position_m": start_position_m, "start_std_m": start_std_m, **options}
         call = Call.with_json(
             "POST", f"{domain_path(domain)}/sessions", document, headers=idempotency_header(idempotency_key)
         )

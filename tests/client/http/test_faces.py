@@ -19,6 +19,7 @@ from deepsimbad.settings import Settings
 from deepsimbad_client import AsyncClient, AsyncSession, Client, Session, errors
 from deepsimbad_client.commands import cli
 from deepsimbad_client.http.admin import Admin, AsyncAdmin, RemapOptions
+from deepsimbad_client.http.client import SessionOptions
 from deepsimbad_client.http.models import SessionState
 
 from .scripted import JOB, POLICY, STATE, Script, answer
@@ -101,7 +102,7 @@ def test_every_operation_has_its_call(operation, tmp_path):
 
 def test_every_option_of_a_remap_and_a_session_can_be_given():
     assert sorted(ASKED) == OPERATIONS, "no call is of an operation that is gone"
-    assert set(SessionBody.model_fields) <= set(inspect.signature(Client.session).parameters)
+    assert set(SessionBody.model_fields) == {"start_position_m", "start_std_m", *SessionOptions.__annotations__}
     members = set(RemapBody.model_fields)
     assert members == {"training_traverse", *RemapOptions.__annotations__}
     options = {

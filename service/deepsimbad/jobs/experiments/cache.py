@@ -85,14 +85,10 @@ class ResultCache:
     folder: Path
     ingredients: Mapping[str, Any]  # by all of them
 
-    def file(self, name: str, **ingredients: Any) -> Path:
-        """The path of a result, which need not be there yet."""
-        identity = json.dumps({**self.ingredients, **ingredients}, sort_keys=True, default=str)
-        return self.folder / f"{name}-{sha256(identity.encode()).hexdigest()[:16]}.json"
-
     def get(self, name: str, make: Callable[[], dict[str, Any]], **ingredients: Any) -> dict[str, Any]:
         """Read a result, or `make` and store it."""
-        file = self.file(name, **ingredients)
+        identity = json.dumps({**self.ingredients, **ingredients}, sort_keys=True, default=str)
+        file = self.folder / f"{name}-{sha256(identity.encode()).hexdigest()[:16]}.json"
         try:
             result: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError):  # not there, or cut short
