@@ -43,7 +43,7 @@ def test_a_stage_counts_by_its_weight(clock, states):
         ("work", 1.0),
     ]
     clock.wait(3)
-    assert progress.seconds() == {"read": 1.0, "work": 5.0}
+    assert progress.seconds({"read", "work"}) == {"read": 1.0, "work": 5.0}
 
 
 def test_the_time_left_is_that_spent_per_share(clock, states):

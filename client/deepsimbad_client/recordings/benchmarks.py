@@ -14,6 +14,7 @@ gmberton/VPR-datasets-downloader, mapillary/mapillary_sls, ori-mrg/robotcar-data
 import csv
 import dataclasses
 import re
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,11 +182,7 @@ def _msls(folder: Path, _: float) -> Recording | None:
         raise SourceError(f"{folder / _PLACES}: the columns key, easting and northing are needed")
     rows.sort(key=lambda row: place_of.get(row["key"], ("", 0)))
     names = {Path(name).stem: name for name in _images(folder / "images")}
-    left_out: dict[str, list[str]] = {
-        "panorama": [],
-        "in postprocessed.csv without an image": [],
-        "without a place": [],
-    }
+    left_out: dict[str, list[str]] = defaultdict(list)
     places = []
     for row in rows:
         north, east = finite_number(row["northing"] or ""), finite_number(row["easting"] or "")

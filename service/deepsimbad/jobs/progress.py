@@ -1,7 +1,7 @@
 """How work reports its progress and learns that it should stop."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from threading import Lock
@@ -85,11 +85,10 @@ class Progress:
             eta_s = stage_left_s + pace_s * max(0.0, 1 - total_share - weight * (1 - share))
         self._on_change(ProgressState(stage, total_share, eta_s))
 
-    def seconds(self) -> dict[str, float]:
-        """The seconds that every stage took so far, by its name with underscores."""
-        ends_s = [*list(self._began_s.values())[1:], self._clock()]
-        stages = zip(self._began_s.items(), ends_s, strict=True)
-        return {name.replace(" ", "_"): end_s - began_s for (name, began_s), end_s in stages}
+    def seconds(self, stages: Collection[str]) -> dict[str, float]:
+        """The seconds that each of some stages took so far, by its name with underscores."""
+        ends_s = zip(self._began_s.items(), [*list(self._began_s.values())[1:], self._clock()], strict=True)
+        return {name.replace(" ", "_"): end_s - began_s for (name, began_s), end_s in ends_s if name in stages}
 
 
 @dataclass

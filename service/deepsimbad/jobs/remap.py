@@ -167,16 +167,11 @@ class _Remap:
             self.evaluator,
             progress.update,
         )
-        seconds = {
-            name: stage_s
-            for name, stage_s in progress.seconds().items()
-            if name.replace("_", " ") in {*REMAP_STAGES, FIT}
-        }
         metrics = {
             "n_map_images": map_.n_images,
             "n_uninformative": int((inputs.training.shows_nothing | inputs.training.is_unlike_all).sum()),
             "n_landmarks": map_.n_landmarks,
-            "seconds": seconds,
+            "seconds": progress.seconds({*REMAP_STAGES, FIT}),
             **results,
             "check": check,
             "warnings": [*results["warnings"], *self._warnings(inputs)],

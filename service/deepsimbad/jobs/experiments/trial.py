@@ -147,7 +147,7 @@ def run_trial(
         outcomes,
         np.array(beliefs, np.float32),
         scores,
-        {stage: seconds for stage, seconds in progress.seconds().items() if stage in TRIAL_STAGES},
+        progress.seconds(TRIAL_STAGES),
         n_forgot,
         map_build.warnings,
     )

@@ -138,8 +138,7 @@ def run_vpr(
         views, moved_m = test_views.by(map_.landmark_model), moves_between(test.drive)
         all_relevances = relevances_by_all(map_builds[Relevance.COMPOSED], views, moved_m, stateless=False)
         passive = drive_in_order(map_, views, test.drive.position_m, all_relevances, true_images, progress.update)
-    stages = {stage.replace(" ", "_") for stage in vpr_stages(config)}
-    seconds = {stage: stage_s for stage, stage_s in progress.seconds().items() if stage in stages}
+    seconds = progress.seconds(vpr_stages(config))
     main_build = map_builds.get(DEFAULT_RELEVANCE, map_builds[config.relevances[0]])
     return VprReport(
         config,
