@@ -66,10 +66,11 @@ def test_another_recipe_is_told_apart_as_other_weights_are(tmp_path, monkeypatch
     (tmp_path / "small.onnx").write_bytes(model().SerializeToString())
     write_pytorch_netvlad(tmp_path / "small.pth", random_network("pytorch_netvlad"))
     kind = {"onnx": "onnx_file"}.get(extractor.partition(":")[0], extractor.partition(":")[0])
-    compute = Compute(Runtime.TORCH, weights_dir=tmp_path)
+    compute, recipe = Compute(Runtime.TORCH, weights_dir=tmp_path), f"deepsimbad.evaluators.extractors.{kind}._RECIPE"
+    monkeypatch.setattr(recipe, 1)
     first = make_extractor(extractor, compute).weights_sha256
     assert first == file_sha256(tmp_path / file if file else weights_file())
-    monkeypatch.setattr(f"deepsimbad.evaluators.extractors.{kind}._RECIPE", 2)
+    monkeypatch.setattr(recipe, 2)
     second = make_extractor(extractor, compute).weights_sha256
     assert re.fullmatch("[0-9a-f]{64}", second)
     assert second != first
