@@ -149,8 +149,8 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
     costs_more = zip(grouped, np.array(ratios)[:, 0] - 1, strict=True)
     worse = [f"{group} (+{100 * cost:.0f} %)" for group, cost in costs_more if cost > 0]
     yield (
-        f"What falls short: of {extractors[0]} a mean of at most 0.6 was asked for, and no split worse "
-        f"than the gradient grid's. Worse: {', '.join(worse) or 'none'}."
+        f"Of {extractors[0]} a mean of at most 0.6 was asked for, and no split worse than the gradient grid's. "
+        f"Worse: {', '.join(worse) or 'none'}."
     )
     yield ""
     costs = []
@@ -166,7 +166,8 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
         "",
         "The railway's frames are 64 x 32 pixels and grey, one metre stands for a frame; frames that show nothing "
         "(grey levels' standard deviation at most 8) in either season are left out. Parameters of the default "
-        "extractor were chosen on these very splits ([0014](../decisions/0014-default-extractor.md)).",
+        "extractor were chosen on these very splits ([0014](../decisions/0014-default-extractor.md), "
+        "[0040](../decisions/0040-gradients-weigh-more.md)).",
     )
 
 
