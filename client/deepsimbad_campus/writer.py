@@ -62,7 +62,10 @@ def _refuse_another(root: Path, date: str, order: dict[str, float]) -> None:
         if (folder / "lb3").exists() or (root / TRUTH_FILE.format(date)).exists():
             raise CampusError(f"{root} holds {date}, but not as a rendered campus: choose another folder")
         return
-    earlier_order = json.loads(file.read_text(encoding="utf-8"))
+    try:
+        earlier_order = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:  # as a loss of power may leave it
+        raise CampusError(f"{file} is damaged: delete {folder} and render it again") from error
     if {**earlier_order, "n_frames": max(earlier_order["n_frames"], order["n_frames"])} != order:
         raise CampusError(
             f"{folder} was rendered with {earlier_order}: ask for that or more frames, or choose another folder"

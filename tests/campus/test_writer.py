@@ -101,6 +101,12 @@ def test_drives_made_otherwise_are_not_mixed(campus, change):
     assert _files(campus) == earlier_files
 
 
+def test_a_damaged_order_is_named(campus):
+    (campus / WINTER / "campus.json").write_bytes(b"")
+    with pytest.raises(CampusError, match=f"{WINTER}/campus.json is damaged: delete"):
+        write_campus(campus, ["winter"], 12, seed=1)
+
+
 @pytest.mark.parametrize("file", [f"{SUMMER}/lb3/Cam5/1344.tiff", f"ground_truth/groundtruth_{SUMMER}.csv"])
 def test_a_real_recording_is_never_touched(tmp_path, file):
     (tmp_path / file).parent.mkdir(parents=True)

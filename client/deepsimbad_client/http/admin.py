@@ -399,9 +399,9 @@ def follow_job(
     """Follow a job until it has succeeded, through lost connections and restarted services.
 
     Listens to its event stream; where that breaks off or there is none, asks for the job now and then, and tries to
-    listen anew. `on_progress` is called with the job each time it
-    is heard of, `on_silence` with the seconds since then each time the service has not answered. Raises JobFailedError,
-    JobCancelledError, TransportError (nothing was heard for `patience_s`; the job itself may go on), ApiError.
+    listen anew. `on_progress` is called with the job each time it is heard of, `on_silence` with the seconds since then
+    each time the service has not answered. Raises JobFailedError, JobCancelledError, TransportError (nothing was heard
+    for `patience_s`; the job itself may go on), ApiError.
     """
     last_heard_s, wait_s = clock(), POLL_S
 

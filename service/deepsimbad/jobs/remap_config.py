@@ -59,7 +59,7 @@ class RemapConfig:
         # What contradicts itself; the range of each parameter is checked where it comes in
         if self.n_landmarks is not None and self.list_length > self.n_landmarks:
             raise InvalidMapConfigError(
-                f"list_length {self.list_length} must be at least 1 and at most n_landmarks",
+                f"list_length {self.list_length} must be at most n_landmarks",
                 list_length=self.list_length,
                 n_landmarks=self.n_landmarks,
             )
