@@ -27,6 +27,7 @@ _EVENING_OUT = 5.0  # times the mean variance, by which a projection's strong di
 _BEAM = 8  # partial lists that are followed at once
 _STILL = 1e-6  # of the greatest standard deviation: a number whose own is less tells nothing
 _MUTE = 1e6  # of the greatest standard deviation: what such a number gets in place of its own
+_RIDGE = 1e-3  # of the mean square along a direction of landmarks
 _BARRED = np.float32(-1e9)
 _ROWS_AT_ONCE = 1024
 _SWEEPS = 4  # rounds in which landmarks are moved towards the places that list them
@@ -327,6 +328,16 @@ def _insert(best: Any, best_of: Any, best_id: Any, n_best: int, score: float, pa
     best[rank], best_of[rank], best_id[rank] = score, partial, landmark
     n_longer: int = min(n_best + 1, best.size)
     return n_longer
+
+
+def fit_to(landmarks: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[r, k] float32: estimates [r] of a vector's products with landmarks [r, k], times it, are that vector.
+
+    By least squares, held back where landmarks tell next to nothing of a direction.
+    """
+    gram = landmarks.T.astype(np.float64) @ landmarks
+    gram[np.diag_indices_from(gram)] += _RIDGE * gram.trace() / len(gram)
+    return np.asarray(np.linalg.solve(gram, landmarks.T).T, np.float32)
 
 
 def lengths_of_sums(lists: NDArray[np.uint16], landmarks: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from deepsimbad.core.composed import Moments, lengths_of_sums
+from deepsimbad.core.composed import Moments, fit_to, lengths_of_sums
 from deepsimbad.core.descriptor import MAX_LANDMARKS, LandmarkStatistics
 from deepsimbad.core.frames import Camera
 from deepsimbad.core.landmark_model import PortableLandmarks, landmark_model_digest, pack_landmarks
@@ -356,6 +356,11 @@ class Map:
     def lengths(self) -> NDArray[np.float32]:
         """[n] float32, length of the weighted sum of every image's landmarks (`composed`)."""
         return lengths_of_sums(self.lists, np.asarray(self.landmark_model["prototypes"], np.float32))
+
+    @cached_property
+    def fit_to_landmarks(self) -> NDArray[np.float32]:
+        """[r, k] float32 that turns estimated products [r] of a unit encoding into the vector that fits them best."""
+        return fit_to(np.asarray(self.landmark_model["prototypes"], np.float32))
 
     @cached_property
     def information_tables(self) -> dict[float, NDArray[np.float32]]:

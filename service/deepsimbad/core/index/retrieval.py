@@ -54,7 +54,8 @@ def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None
     """[..., r] float32, products of a view's unit encoding with the landmarks: from its encoding, else estimated.
 
     Dissimilarities from on board are by the map's statistics, so a session standardises every landmark's product by its
-    own views, and brings it back to the map's. Of ranks alone the normal scores stand in for products.
+    own views, and brings it back to the map's. Of ranks alone the normal scores stand in for products. Such estimates
+    err for every landmark by itself, though they are products of one vector: that which fits them best gives them anew.
 
     Args:
         live: A session's own statistics; None: the map's.
@@ -72,14 +73,14 @@ def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None
         u = unit_encodings(query.encoding, statistics.encodings or map_statistics.encodings, model.get("projection"))
         return np.asarray(u @ model["prototypes"].T, np.float32)
     if products is None:
-        return np.asarray(
-            map_statistics.products.mean - map_statistics.products.std * statistics.ranks.view(query.ranks).z,
-            np.float32,
-        )
-    if live is None or live.products is None:
+        z = -statistics.ranks.view(query.ranks).z
+    elif live is None or live.products is None:
         return products
-    z = (products - live.products.mean) / live.products.std
-    return np.asarray(map_statistics.products.mean + map_statistics.products.std * z, np.float32)
+    else:
+        z = (products - live.products.mean) / live.products.std
+    estimates = map_statistics.products.mean + map_statistics.products.std * z
+    u = estimates @ map_.fit_to_landmarks
+    return np.asarray(u @ map_.landmark_model["prototypes"].T, np.float32)
 
 
 def _rrf(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
