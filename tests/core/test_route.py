@@ -39,13 +39,23 @@ def test_a_bin_of_the_histogram_holds_what_lies_in_it(n, closed):
     route = Route(position_m, closed)
     edges_m, bin_mass = route.histogram_edges_m, route.histogram_of(mass)
     assert (bin_mass > 0).all()
-    until_m = np.append((position_m[1:] + position_m[:-1]) / 2, edges_m[-1])
-    from_m = np.append(edges_m[0], until_m[:-1])
+    middle_m, round_m = (position_m[1:] + position_m[:-1]) / 2, route.length_m
+    around_m = (position_m[-1] - round_m + position_m[0]) / 2 if closed else edges_m[0]
+    from_m, until_m = np.r_[around_m, middle_m], np.r_[middle_m, around_m + round_m]
     for first_m, last_m, share in zip(edges_m, edges_m[1:], bin_mass, strict=False):
-        within_m = np.clip(np.minimum(last_m, until_m) - np.maximum(first_m, from_m), 0, None)
+        within_m = sum(
+            np.clip(np.minimum(last_m, until_m + turn_m) - np.maximum(first_m, from_m + turn_m), 0, None)
+            for turn_m in ((0.0, round_m) if closed else (0.0,))
+        )
         length_m = np.maximum(until_m - from_m, 1e-12)
         points = (until_m == from_m) & (until_m > first_m) & (until_m <= last_m)
         assert share == pytest.approx(mass @ (within_m / length_m) + mass[points].sum() + (n == 1), abs=1e-9)
+
+
+def test_a_belief_that_knows_nothing_fills_the_bins_of_a_loop_alike():
+    """Whatever the last image is away from the first: either stands for half of that."""
+    route = Route(np.arange(4) * 10.0, closed=True, **CORNERS)
+    np.testing.assert_allclose(route.histogram_of(route.cell_m / route.length_m), 0.25)
 
 
 def test_offsets_take_the_short_way_round():

@@ -192,24 +192,29 @@ class Route:
 
     def histogram_of(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
         """[b] masses of those bins, from masses of map images [n] that each spread over the stretch it stands for."""
-        n_whole, share = self._bin_ends
-        partial_mass = share * mass[np.minimum(n_whole, self.n_images - 1)]
+        n_whole, share, share_behind = self._bin_ends
+        if self.closed:  # the first image's stretch begins before the end
+            mass = np.append(mass, share_behind * mass[0])
+            mass[0] -= mass[-1]
+        partial_mass = share * mass[np.minimum(n_whole, mass.size - 1)]
         bin_mass = _sums_up_to(mass, n_whole) + partial_mass
         bin_mass[1:] -= partial_mass[:-1]
         return np.maximum(bin_mass, 0.0)  # rounding may make it less
 
     @cached_property
-    def _bin_ends(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """[b], [b] number of images whose stretches end before each bin's end, and the next one's share before it."""
-        until_m = np.append((self.position_m[1:] + self.position_m[:-1]) / 2, self.histogram_edges_m[-1])
+    def _bin_ends(self) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
+        """[b], [b] number of stretches that end before each bin's end, and the next one's share before it.
+
+        And the share of the first image's stretch that a closed route has behind its last image, as one stretch more.
+        """
+        places_m = np.append(self.position_m, self.histogram_edges_m[-1]) if self.closed else self.position_m
+        until_m = np.append((places_m[1:] + places_m[:-1]) / 2, self.histogram_edges_m[-1])
         from_m, end_m = np.append(self.start_m, until_m), self.histogram_edges_m[1:]
         n_whole = np.searchsorted(until_m, end_m, side="right")
-        next_image = np.minimum(n_whole, self.n_images - 1)
-        length_m = until_m[next_image] - from_m[next_image]
-        share = np.where(
-            n_whole < self.n_images, (end_m - from_m[next_image]) / np.maximum(length_m, _LEAST_LENGTH_M), 0.0
-        )
-        return n_whole, share
+        next_stretch, length_m = np.minimum(n_whole, until_m.size - 1), np.diff(from_m)
+        share = (end_m - from_m[next_stretch]) / np.maximum(length_m[next_stretch], _LEAST_LENGTH_M)
+        share_behind = length_m[-1] / max(length_m[0] + length_m[-1], _LEAST_LENGTH_M)
+        return n_whole, np.where(n_whole < until_m.size, share, 0.0), float(share_behind)
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
