@@ -1,5 +1,7 @@
 """NNQL against slow and obvious references; sessions fed back teach what training on the same moves would have."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -161,6 +163,17 @@ def test_the_end_of_the_route(world):
     map_, ranks = world
     moves = transitions_of(map_, walk_of(ranks, [55, 57, 58, 59]), NnqlConfig())
     assert moves.next_allowed.tolist() == [[True, True, False], [True, False, False], [False, False, False]]
+
+
+def test_on_a_loop_a_truth_of_a_later_round_is_that_of_the_first(world):
+    map_, ranks = world
+    loop, frames = replace(map_, closed=True), [4, 9, 10, 12, 17, 22, 27, 28, 33]
+    first_round, third_round = (
+        transitions_of(loop, walk_of(ranks, frames, true_position_m=frames + turns_m), NnqlConfig(top_share=0.03))
+        for turns_m in (np.zeros(9), np.full(9, 2 * loop.route.length_m))
+    )
+    assert first_round.reward.any()
+    assert third_round.reward.tolist() == first_round.reward.tolist()
 
 
 def test_a_belief_wholly_past_the_end_begins_anew(world):

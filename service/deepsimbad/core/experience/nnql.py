@@ -122,7 +122,8 @@ class KnownWalk:
 
     queries: Sequence[Query]  # the t described views, in order of time
     action_m: NDArray[np.float64]  # [t] metres moved before every view; the first is ignored
-    true_position_m: NDArray[np.float64]  # [t] route positions; NaN where unknown
+    # [t] route positions, on a closed route any number of rounds on; NaN where unknown
+    true_position_m: NDArray[np.float64]
 
     def __post_init__(self) -> None:
         if not len(self.queries) == self.action_m.size == self.true_position_m.size:
@@ -155,7 +156,7 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
             continue
         action = int(np.abs(actions_m - walk.action_m[t]).argmin())
         if abs(actions_m[action] - walk.action_m[t]) <= reach_m:
-            truth = route.nearest_image(walk.true_position_m[[t]]).astype(np.int64)
+            truth = route.nearest_image(route.wrapped(walk.true_position_m[[t]])).astype(np.int64)
             is_earned = rank_of_truth(state.belief.mass, truth) < config.top_share * route.n_images
             outcomes.append((t, action, config.reward * is_earned))
     views = np.array([view for view, _, _ in outcomes], np.int64)
