@@ -13,6 +13,8 @@ from deepsimbad.errors import InvalidEncodingError
 from deepsimbad.evaluators.base import Lesson
 from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.evaluators.fused import Fused
+from deepsimbad.jobs.append import append_drive
+from deepsimbad.jobs.build import measure_drive
 from deepsimbad.jobs.experiments.vpr import DriveViews, VprConfig, build_maps, score_maps, vpr_stages
 from deepsimbad.jobs.fitting import Fitter
 from deepsimbad.jobs.progress import Progress
@@ -102,6 +104,18 @@ def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better
         live_statistics.encodings.std[D:], map_statistics.encodings.std[D:], "what was not told taught something"
     )
     assert (live_statistics.encodings.mean[:D] != map_statistics.encodings.mean[:D]).all()
+
+
+def test_a_frame_without_one_half_can_be_appended():
+    """As one in which a detector finds nothing."""
+    first_map = score(Relevance.COMPOSED, FUSED, None, season(1, 1.0, 1.0))[0].map
+    drive = season(2, 1.0, 1.0).at(np.arange(20))
+    drive.encodings[5, D:] = 0
+    longer_map = append_drive(first_map, measure_drive(drive, first_map.landmark_model, FUSED))
+    longer_map.check()
+    means = (N * first_map.usual_encoding[0, D:] + 20 * drive.encodings[:, D:].mean(axis=0)) / (N + 20)
+    means += first_map.usual_encoding[0, D:] / (N + 20)  # stands for what is not known
+    np.testing.assert_allclose(longer_map.usual_encoding[0, D:], means, atol=1e-5)
 
 
 def test_what_an_encoder_broke_does_not_pass_for_a_half_that_is_missing():

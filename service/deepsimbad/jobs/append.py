@@ -39,6 +39,7 @@ from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import same_places
 from deepsimbad.errors import InvalidEncodingError, InvalidMapConfigError, NoActiveMapError, WeightsDifferError
+from deepsimbad.evaluators.space import as_usual
 from deepsimbad.jobs.check import traverses_in
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.records import DomainRecord, MapRecord
@@ -314,7 +315,8 @@ def append_drive(map_: Map, drive: Drive) -> Map:
         ranks = map_statistics.ranks.pooled(map_.n_images, drive_ranks, drive.n_frames)
         fields["statistics"] = np.stack([ranks.mean, ranks.std])
     if map_statistics is not None and map_statistics.encodings is not None:
-        drive_moments, model = Moments.counted(drive.encodings), map_.landmark_model
+        model = map_.landmark_model
+        drive_moments = Moments.counted(as_usual(drive.encodings, model))  # a half that a frame lacks is the usual one
         moments = map_statistics.encodings.pooled(map_statistics.encodings.weight, drive_moments, drive.n_frames)
         u = described(drive.encodings, moments, model.get("projection"))
         lists = compose(u, model["prototypes"], map_.list_length)
