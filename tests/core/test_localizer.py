@@ -217,6 +217,23 @@ def test_a_view_that_shows_nothing_moves_no_belief(snapshots, queries, kind, rel
     assert standing_step.state.n_observations == 4
 
 
+@pytest.mark.parametrize("kind", list(FilterKind))
+def test_a_view_is_as_new_as_the_way_from_the_last_that_showed_a_place(snapshots, queries, kind):
+    """Whether the robot moved before or after it saw nothing: where it stands again it is not where that view was."""
+    localizer, grey = ActiveLocalizer(snapshots(), LocalizerConfig(kind)), Query.uninformative(N_LANDMARKS)
+    beliefs = []
+    for moves_m in ([5.0, 0.0], [0.0, 5.0]):
+        state = walk(localizer, queries, [10, 15])
+        for query, action_m in zip((grey, queries[20]), moves_m, strict=True):
+            state = localizer.from_arrays(localizer.to_arrays(state))
+            state = localizer.observe(state, query, action_m).state
+        beliefs.append(state.belief)
+    one, other = (belief.doubt for belief in beliefs)
+    np.testing.assert_allclose(
+        one.log_trust, other.log_trust, atol=0.2
+    )  # 2 and more apart where only the last move counts
+
+
 def test_noise_tells_nothing_of_a_route_and_an_odd_season_does():
     """A route of 400 numbers that few causes vary; noise shows what no place does, the same wherever the robot is."""
     rng = np.random.default_rng(6)

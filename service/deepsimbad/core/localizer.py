@@ -115,7 +115,7 @@ class ActiveLocalizer:
         mass_moved = 0.0
         shows_place = query.is_informative and not is_strange
         if shows_place:
-            shared_error = map_.shared_error_after(moved_m) if step > 0 else 0.0
+            shared_error = map_.shared_error_after(belief.doubt.since_last_m)
             evidence = ViewEvidence.of(relevance, self._update, map_.log_likelihood_scale, shared_error)
             belief = belief.updated(evidence, step)
             mass_moved = belief.mass_moved

@@ -125,7 +125,9 @@ class Doubt:
 
     lost: NDArray[np.float64]  # [t] probability of being lost, by trust
     log_trust: NDArray[np.float64]  # [t] logarithm of each trust's weight: how well it has predicted the views so far
-    last: NDArray[np.float64] | None = None  # [n] values of the last view, carried along by the moves since
+    # [n] values of the last view that showed a place, carried along by the moves since; and how far these have led
+    last: NDArray[np.float64] | None = None
+    since_last_m: float = 0.0
 
     @classmethod
     def at_start(cls, rule: UpdateRule, lost: float) -> Self:
@@ -152,12 +154,15 @@ class Doubt:
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """The named arrays from which `from_arrays` restores it."""
         arrays = {"lost": self.lost, "log_trust": self.log_trust}
-        return arrays if self.last is None else {**arrays, "last": self.last}
+        if self.last is None:
+            return arrays
+        return {**arrays, "last": self.last, "since_last_m": np.array([self.since_last_m])}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
         """The doubt whose arrays `arrays` gave."""
-        return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"))
+        since_last_m = arrays.get("since_last_m", np.zeros(1))  # earlier releases had none
+        return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"), float(since_last_m[0]))
 
 
 def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:

@@ -128,7 +128,8 @@ class GridFilter:
             cells.closed,
         )
         last = None if doubt.last is None else _shift(doubt.last, shift, cells.closed)
-        return GridFilter(self.route, masses, offset_m, Doubt(lost / total, doubt.log_trust, last))
+        doubt = Doubt(lost / total, doubt.log_trust, last, doubt.since_last_m + action_m)
+        return GridFilter(self.route, masses, offset_m, doubt)
 
     def updated(self, evidence: ViewEvidence, step: int) -> "GridFilter":  # noqa: ARG002
         """The belief after a view; `step` as of `predicted`."""

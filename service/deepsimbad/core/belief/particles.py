@@ -133,7 +133,7 @@ class ParticleFilter:
             position_m=position_m,
             weights=weights * staying[:, np.newaxis],
             found_mass=found_mass,
-            doubt=replace(self.doubt, lost=lost, last=last),
+            doubt=replace(self.doubt, lost=lost, last=last, since_last_m=self.doubt.since_last_m + action_m),
         )
         return belief._resampled(step) if (weights.sum(axis=0) == 0).any() and surviving.any() else belief
 
