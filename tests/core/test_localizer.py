@@ -228,7 +228,7 @@ def test_a_view_is_as_new_as_the_way_from_the_last_that_showed_a_place(snapshots
             state = localizer.from_arrays(localizer.to_arrays(state))
             state = localizer.observe(state, query, action_m).state
         beliefs.append(state.belief)
-    one, other = (belief.doubt for belief in beliefs)
+    first_doubt, second_doubt = (belief.doubt for belief in beliefs)
     np.testing.assert_allclose(
         one.log_trust, other.log_trust, atol=0.2
     )  # 2 and more apart where only the last move counts
