@@ -78,11 +78,11 @@ def test_every_kind_of_view_finds_its_place(seasons):
 
 def test_of_ranks_the_one_vector_counts_that_fits_all_scores_best(seasons):
     map_ = compose_map(PLAN, drive_of(seasons[1]), drive_of(seasons[0]), None, 100).map
-    landmarks, usual, errors = map_.landmark_model["prototypes"].astype(np.float64), map_.live_statistics, []
+    landmarks, statistics, errors = map_.landmark_model["prototypes"].astype(np.float64), map_.live_statistics, []
     for row in seasons[2].astype(np.float32):
         exact = products_with_landmarks(map_, Query(np.ones(100, np.float32), encoding=row))
         ranks = rank_landmarks(2 - 2 * exact)
-        scores = usual.products.mean - usual.products.std * usual.ranks.standardise(ranks)
+        scores = statistics.products.mean - statistics.products.std * statistics.ranks.standardise(ranks)
         products = products_with_landmarks(map_, Query(ranks))
         assert products == pytest.approx(landmarks @ np.linalg.lstsq(landmarks, scores)[0], abs=0.02)
         errors.append([np.linalg.norm(estimates - exact) for estimates in (products, scores)])
