@@ -228,10 +228,9 @@ def test_a_view_is_as_new_as_the_way_from_the_last_that_showed_a_place(snapshots
             state = localizer.from_arrays(localizer.to_arrays(state))
             state = localizer.observe(state, query, action_m).state
         beliefs.append(state.belief)
-    first_doubt, second_doubt = (belief.doubt for belief in beliefs)
-    np.testing.assert_allclose(
-        one.log_trust, other.log_trust, atol=0.2
-    )  # 2 and more apart where only the last move counts
+    first_log_trust, second_log_trust = (belief.doubt.log_trust for belief in beliefs)
+    # Where the last move alone counts they are 2 and more apart
+    np.testing.assert_allclose(first_log_trust, second_log_trust, atol=0.2)
 
 
 def test_noise_tells_nothing_of_a_route_and_an_odd_season_does():
