@@ -15,6 +15,7 @@ from deepsimbad.engine.truths import Truths, true_images
 from deepsimbad.engine.worker import Priority
 
 from .conftest import (
+    KEEP_ENDED_S,
     Clock,
     Service,
     add_domain,
@@ -120,3 +121,17 @@ async def test_truths_told_bit_by_bit_follow_a_session_once(service, monkeypatch
     assert first_rows == [0, 3]
     np.testing.assert_array_equal(last_ranking.rank_share[3:], ranking.rank_share[3:])
     assert last_ranking.n_left_out == 0
+
+
+async def test_a_session_that_has_the_number_of_a_forgotten_one_is_followed_from_its_own_beginning(service, clock):
+    truths = truths_of(service)
+    forgotten_id, _ = await drive_session(service, [ranked_observation(seed, 0.1) for seed in range(3)])
+    number = (await truths.rank(forgotten_id, [1.0] * 3)).session.number
+    await service.sessions.end(forgotten_id)
+    clock.now_s += KEEP_ENDED_S + 1
+    await service.sessions.sweep()
+    session_id, masses = await drive_session(service, [ranked_observation(seed, 0.4) for seed in range(10, 16)])
+    ranking = await truths.rank(session_id, [None] * 5 + [30.0])
+    assert ranking.session.number == number
+    route = service.maps.active("d").snapshot.route
+    assert ranking.rank_share[-1] == pytest.approx(slow_share(masses[-1], route, 30.0))

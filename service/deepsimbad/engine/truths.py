@@ -90,8 +90,9 @@ class Truths:
         self._worker = worker
         self._sessions = sessions
         self._clock = clock
-        # By session, the number of observations ranked last and the state after them: truths come bit by bit
-        self._resume_points: dict[int, tuple[int, StateSnapshot]] = {}
+        # By session's id (a number may be another's later), the number of observations ranked last and the state after
+        # them: truths come bit by bit
+        self._resume_points: dict[str, tuple[int, StateSnapshot]] = {}
 
     async def rank(
         self,
@@ -180,11 +181,11 @@ class Truths:
                 rank(number, state.belief)
             return number == last
 
-        n_before, snapshot = self._resume_points.pop(record.number, (0, None))
+        n_before, snapshot = self._resume_points.pop(record.session_id, (0, None))
         state = await replayed_until(
             self._store, self._worker, record, engine, is_last, snapshot if n_before <= first else None
         )
-        self._resume_points[record.number] = state.belief.n_observations, state.snapshot()
+        self._resume_points[record.session_id] = state.belief.n_observations, state.snapshot()
         while len(self._resume_points) > _MOST_RESUMABLE:
             del self._resume_points[next(iter(self._resume_points))]
 
