@@ -118,22 +118,31 @@ class Scene:
             return error.reason
 
     def look(
-        self, session: Session, row: int, view: dict[str, Any], action_m: float | None, **options: Any
+        self,
+        session: Session,
+        row: int,
+        view: dict[str, Any],
+        action_m: float | None,
+        n_counted: int | None = None,
+        **options: Any,
     ) -> ViewOutcome | str:
         """Send a session a move and the view after it; returns the outcome, or why the service cannot use the view.
 
         Viewers are shown the outcome. A belief that is wrong may leave no room for the move that was really made, and a
         recording may jump or go backwards; the robot then starts anew from knowing nothing. A prior needs a position,
         so that this is a normal belief a hundred routes wide, where `ActiveLocalizer.observe_or_restart` has an even
-        one; and the view after it counts as one of a robot that stands. `options` are those of `Session.observe`.
+        one; and the view after it counts as one of a robot that stands. `n_counted` is how many views counted before
+        this one, where an earlier run may have sent it: if so it is not forgotten. `options` are those of
+        `Session.observe`.
         """
         start_s, forgot = time.perf_counter(), False
         try:
             try:
                 answer = session.observe(**view, **options, action_m=action_m)
             except (InvalidMoveError, IdempotencyKeyReusedError):  # a reused key: an earlier run sent the view below
-                middle_m = float(np.median(self.route.position_m))
-                session.set_prior(middle_m, 100 * max(self.route.length_m, 1.0))
+                if n_counted is None or session.state().n_observations == n_counted:
+                    middle_m = float(np.median(self.route.position_m))
+                    session.set_prior(middle_m, 100 * max(self.route.length_m, 1.0))
                 forgot = True
                 answer = session.observe(**view, **options)
         except InvalidInputError as error:

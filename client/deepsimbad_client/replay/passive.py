@@ -146,6 +146,7 @@ class _Drive:
         action_m = None if self._last_row is None else float(scene.position_m[row] - scene.position_m[self._last_row])
         # A key for each view: one that was answered, but not written to the journal, is sent again and counts once.
         options: dict[str, Any] = {"idempotency_key": f"view-{row}", "shortlist": 1}
+        options["n_counted"] = self._n_ranked + len(self._unranked_rows)
         outcome = view if isinstance(view, str) else scene.look(self._session, row, view, action_m, **options)
         if isinstance(outcome, str):
             step = replace(step, broken=outcome)

@@ -131,6 +131,28 @@ def test_jumps_and_drives_backwards_begin_anew(client, encodings, tmp_path):
     assert [step.true_route_m for step in result.steps] == [0.0, 3.0, 114.0]
 
 
+def test_a_view_that_began_anew_still_counts_where_the_replay_goes_on(client, encodings, tmp_path, monkeypatch):
+    rows = [0, 3, 114, 115, 116, 117]
+    frames = tuple(Frame(i, str(i), float(row)) for i, row in enumerate(rows))
+    recording = Recording("jumping", frames, encodings=np.load(encodings / "winter.npy")[rows])
+    full_replay = replay(client, recording, "route", tmp_path / "whole")
+    append = Journal.append
+
+    def stop(journal, document):
+        if isinstance(document, dict) and document["forgot"]:
+            raise KeyboardInterrupt
+        append(journal, document)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "append", stop)
+        with pytest.raises(KeyboardInterrupt):
+            replay(client, recording, "route", tmp_path / "parts")
+    resumed = replay(client, recording, "route", tmp_path / "parts")
+    assert [(step.forgot, step.mass) for step in resumed.steps] == [
+        (step.forgot, step.mass) for step in full_replay.steps
+    ]
+
+
 def test_a_domain_without_a_map_cannot_be_replayed_against(client, encodings, tmp_path):
     client.admin.put_domain("bare", ENCODINGS)
     with pytest.raises(errors.ReplayError, match="remap"):
