@@ -212,6 +212,17 @@ def test_a_cancel_is_enforced(catalog, job, caplog):
     assert "killed" in error.message
 
 
+def test_a_cancel_that_comes_too_late_leaves_the_result(catalog, job, monkeypatch):
+    script = """print('words\\n{"result": {"map_version": 1}}')"""
+    process = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    monkeypatch.setattr(InAnotherProcess, "_start", lambda *_: process)
+
+    def ends_first():
+        return process.wait() == 0
+
+    assert InAnotherProcess(catalog.data_dir, 1)(job, ignore, ends_first) == {"map_version": 1}
+
+
 def test_without_its_parent_it_ends(catalog, job):
     order = {"job": asdict(job), "data_dir": str(catalog.data_dir), "n_threads": 1, "log_level": logging.INFO}
     order["parent_pid"] = os.getpid()

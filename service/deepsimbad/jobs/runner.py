@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -419,7 +420,8 @@ def _send(child: "subprocess.Popen[bytes]", line: bytes) -> None:
 def _end(child: "subprocess.Popen[bytes]") -> None:
     """Leave nothing of a child, whatever happened."""
     if child.stdin is not None:
-        child.stdin.close()
+        with suppress(BrokenPipeError):  # what it died too early to hear
+            child.stdin.close()
     try:
         child.wait(_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
