@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from .conftest import DIM, IS_FLEET, N_READY, problem, ready_encodings, service, wait_until
+from .conftest import DIM, IS_FLEET, N_READY, of_one_process, problem, ready_encodings, service, wait_until
 
 SAME_ROUTE = {"same_route": True}
 
@@ -290,6 +290,21 @@ def test_an_old_version_is_removed_by_hand(client, domain, data_dir):
     ):
         assert problem(answer, 410, "retired_map")["map_version"] == 1
     assert client.get(f"/v1/domains/{domain}").json()["map_version"] == 2
+
+
+@of_one_process
+def test_a_version_that_is_removed_while_its_file_is_read_for_a_download_is_gone(client, domain, monkeypatch):
+    catalog = client.services.catalog
+    map_file = catalog.map_file
+
+    def removed_behind_it(*version):
+        path = map_file(*version)
+        catalog.remove_map(*version, lambda: False)
+        return path
+
+    client.remap(domain, relevance="rrf")
+    monkeypatch.setattr(catalog, "map_file", removed_behind_it)
+    problem(client.get(place_of(domain)), 410, "retired_map")
 
 
 def test_versions_beyond_those_kept_lose_their_files(tmp_path):

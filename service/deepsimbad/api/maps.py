@@ -142,15 +142,17 @@ def get_map_file(domain: DomainName, version: MapVersion, request: Request, serv
     sha256 = services.catalog.sealed_digest(domain, version)
     try:
         path = services.catalog.map_file(domain, version)
-    except DamagedMapError as error:
+        status = path.stat()
+    except (DamagedMapError, FileNotFoundError) as error:
         raise unreadable_error(services.catalog, domain, version) from error
     etag = f'"sha256:{sha256}"'
     if has_tag(request.headers.get("if-none-match"), etag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={**REVALIDATE, "ETag": etag})
-    request.scope["headers"] = one_range(request.scope["headers"], path.stat().st_size)
+    request.scope["headers"] = one_range(request.scope["headers"], status.st_size)
     repr_digest = base64.b64encode(bytes.fromhex(sha256)).decode()
     headers = {**REVALIDATE, "ETag": etag, "Repr-Digest": f"sha-256=:{repr_digest}:"}
-    return FileResponse(path, headers=headers, media_type=MEDIA_TYPE, filename=f"{domain}-{version:06d}.sqlite")
+    filename = f"{domain}-{version:06d}.sqlite"
+    return FileResponse(path, headers=headers, media_type=MEDIA_TYPE, filename=filename, stat_result=status)
 
 
 def one_range(headers: Headers, n_bytes: int) -> Headers:
