@@ -1,3 +1,4 @@
+import os
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +21,7 @@ from deepsimbad.errors import (
     UnknownTraverseError,
     WeightsDifferError,
 )
-from deepsimbad.store import traverses
+from deepsimbad.store import layout, traverses
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.traverses import Traverse
 
@@ -209,6 +210,19 @@ def test_what_frames_show_is_stored_with_them_and_levels_with_the_frame_that_gav
     with pytest.raises(GreyLevelsDifferError):
         summer.put_frames(replace(make_frames([6]), grey_levels=(0, 1023)))
     assert (summer.n_frames, summer.grey_levels) == (4, (0, 4095))
+
+
+def test_frames_are_counted_that_are_written_over_what_the_log_held_before(
+    summer: Traverse, campus: Catalog, make_frames: MakeFrames
+) -> None:
+    summer.put_frames(make_frames(range(50)))
+    summer._db.conn.execute("PRAGMA wal_checkpoint")  # the next write begins the log anew, which stays as long
+    log = layout.traverse_path(campus.data_dir, "campus", "summer").with_suffix(".sqlite-wal")
+    os.utime(log, (0, 0))
+    n_bytes = log.stat().st_size
+    assert summer.summary().n_uninformative == 0
+    summer.put_frames(frame(50, make_frames([50]).encodings[0], 99.0, shows_nothing=np.array([True])))
+    assert (summer.summary().n_uninformative, log.stat().st_size) == (1, n_bytes)
 
 
 def test_the_camera_of_an_unchanged_traverse_is_read_once(campus: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,9 +69,13 @@ def look_at(path: Path, ask: Callable[[Database], T]) -> T:
 
 
 def file_state(path: Path) -> FileState:
-    """What changes with every write: the file's inode, size and time, and the size of its log."""
+    """What changes with every write: the file's inode, size and time, and the time and size of its log.
+
+    A log that begins anew is written over: it keeps its size.
+    """
     file, log = path.stat(), path.with_name(f"{path.name}-wal")
-    return file.st_ino, file.st_size, file.st_mtime_ns, log.stat().st_size if log.exists() else 0
+    log_state = (log.stat().st_mtime_ns, log.stat().st_size) if log.exists() else (0, 0)
+    return file.st_ino, file.st_size, file.st_mtime_ns, *log_state
 
 
 @contextmanager
