@@ -139,7 +139,7 @@ class ApiError(DeepSimbadClientError):
     @property
     def advice(self) -> str:
         """Words for what the caller can do about the error; "" where there is nothing to add to the message."""
-        return self._advice.format_map({"needed": "admin", "map_version": None, **self.problem})
+        return self._advice.format_map({"map_version": None, **self.problem})
 
     def __str__(self) -> str:
         request = f", request {self.request_id}" if self.request_id else ""
@@ -148,15 +148,23 @@ class ApiError(DeepSimbadClientError):
 
 
 _GIVE = "give it in $DEEPSIMBAD_API_KEY or --api-key"
-_MAKE = "`deepsimbad keys create --scope {needed}` makes one where the service runs; " + _GIVE
+_MAKE = "`deepsimbad keys create {options}` makes one where the service runs; " + _GIVE
 
 
 class UnauthorizedError(ApiError, status=401, code="unauthorized", advice=_GIVE):
     """401: no key, or one the service does not know."""
 
 
-class ForbiddenError(ApiError, status=403, code="forbidden", advice=_MAKE):
-    """403: the key lacks the scope this call needs."""
+class ForbiddenError(ApiError, status=403, code="forbidden"):
+    """403: the key lacks the scope this call needs, or is for other domains."""
+
+    @property
+    def advice(self) -> str:
+        """How to come by another key, where that is what the service asks for."""
+        if domains := self.problem.get("domains"):
+            return f"it opens {', '.join(domains)}; " + _MAKE.format(options="--scope localize --domain NAME")
+        scope = self.problem.get("needed")
+        return _MAKE.format(options=f"--scope {scope}") if scope else ""
 
 
 class NotFoundError(ApiError, status=404):

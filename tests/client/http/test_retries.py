@@ -127,6 +127,11 @@ def test_a_delete_whose_answer_was_lost_is_not_an_error():
             {"code": "forbidden", "detail": "it has localize", "needed": "admin"},
             "create --scope admin`",
         ),
+        (
+            403,
+            {"code": "forbidden", "detail": "for other domains", "domains": ["yard", "hall"]},
+            "; it opens yard, hall; `deepsimbad keys create --scope localize --domain NAME`",
+        ),
     ],
 )
 def test_a_refused_key_is_not_tried_again_and_the_error_says_how_to_come_by_one(status, problem, advice):
@@ -137,6 +142,13 @@ def test_a_refused_key_is_not_tried_again_and_the_error_says_how_to_come_by_one(
     assert advice in str(raised.value)
     assert str(raised.value).count("keys create") == 1
     assert "$DEEPSIMBAD_API_KEY" in str(raised.value)
+
+
+def test_no_key_is_advised_where_none_would_help():
+    script = Script(answer(403, {"code": "foreign_host", "detail": "it is not asked by the name 'x'"}))
+    with pytest.raises(errors.ForbiddenError) as raised:
+        script.client().domain("d")
+    assert str(raised.value).endswith("by the name 'x' (403 foreign_host)")
 
 
 def test_an_answer_that_is_not_the_services_leads_to_its_address():
