@@ -199,6 +199,19 @@ def test_an_image_is_encoded_once_for_all_domains_of_an_extractor(client, monkey
     client.delete("/v1/admin/domains/seen-too")
 
 
+def test_a_picture_is_held_against_those_of_the_likeliest_domain(client):
+    client.make_domain("upright", **TAKES_IMAGES)
+    client.answer_to("POST", "/v1/admin/domains/upright/traverses", json={"name": "drive"})
+    for index in range(6):
+        frame = f"/v1/admin/domains/upright/traverses/drive/frames/{index}"
+        client.answer_to("PUT", frame, params={"position_m": index}, **image_body(np.rot90(picture(50 + index))))
+    client.make_map("upright", n_landmarks=4, list_length=3)
+    domains = {"domains": ["seen", "upright"]}
+    answer = client.answer_to("POST", URL, params=domains, **image_body(picture(7)))
+    assert (answer["domains"][0]["domain"], answer["warnings"]) == ("seen", [])
+    client.delete("/v1/admin/domains/upright")
+
+
 def test_a_key_asks_its_own_domains_alone(tmp_path):
     with service(tmp_path) as client:
         for name in ("mine", "other"):

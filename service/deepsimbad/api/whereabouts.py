@@ -223,7 +223,7 @@ async def post_whereabouts(
     ):
         await run_sync(_check_one_landmark_model, mapped_domains)
     watch.lap("maps")
-    parts, remarks = [Part({}, {}, left_out)], list[str]()
+    parts, remarks = [Part({}, {}, left_out)], dict[str, Sequence[str]]()  # on the view, beside every domain's pictures
     for evaluator, members in _encoding_groups(services, mapped_domains):
         try:
             view, view_remarks = await view_in(body, services, media_type, evaluator, members[0].snapshot, observation)
@@ -238,13 +238,14 @@ async def post_whereabouts(
         except DeepSimbadError as error:
             parts.append(Part({}, {}, {member.record.name: error for member in members}))
         else:
-            remarks += [remark for remark in view_remarks if remark not in remarks]
+            remarks |= {member.record.name: view_remarks for member in members}
         watch.lap("compare")
     posterior = whereabouts(parts, in_full)
     if not posterior.likeliest:
         raise _no_answer(posterior.left_out)
+    likeliest_remarks = remarks[next(iter(posterior.probabilities))]
     _, answer = await services.render_json(
-        in_full * (shortlist or 1), render_whereabouts, posterior, watch, remarks, shortlist
+        in_full * (shortlist or 1), render_whereabouts, posterior, watch, likeliest_remarks, shortlist
     )
     return Response(answer, media_type=JSON)
 
