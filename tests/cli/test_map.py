@@ -159,9 +159,10 @@ def test_images_are_found_where_they_were_taken(deepsimbad, mapped_pictures, pic
     lying = tmp_path / "lying.png"
     cv2.imwrite(str(lying), cv2.rotate(cv2.imread(str(views[0])), cv2.ROTATE_90_CLOCKWISE))
     (answer,) = json.loads(deepsimbad("localize", "route", lying, "--json").out)
-    assert any("they lie on their side" in warning for warning in answer["warnings"])
-    table = deepsimbad("localize", "route", *views)
+    (warning,) = [warning for warning in answer["warnings"] if "they lie on their side" in warning]
+    table = deepsimbad("localize", "route", *views, lying)
     assert table.code == 0
+    assert f"warning: {warning}: 1 of 3 ({lying})\n" in table.err
     assert re.search(r"/7\.png +│ 7\.png +│ 21\.0 m", table.out), table.out
     assert "63.0 m" in table.out
 

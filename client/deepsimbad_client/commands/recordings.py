@@ -33,6 +33,7 @@ from deepsimbad_client.recordings.options import (
     reading,
     rotate_option,
     tell_left_out,
+    tell_warnings,
     views,
 )
 from deepsimbad_client.replay import DEFAULT_PLANNER, Viewer
@@ -148,6 +149,7 @@ def localize(
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
     else:
         show(place_table(answers))
+        tell_warnings([(name, answer.warnings) for name, answer in answers])
 
 
 def _localize_anywhere(
@@ -162,6 +164,7 @@ def _localize_anywhere(
         click.echo(as_json([{"image": name, **answer.model_dump(mode="json")} for name, answer in answers]))
         return
     show(whereabouts_table(answers))
+    tell_warnings([(name, answer.warnings) for name, answer in answers])
     for domain in {domain.domain: domain for _, answer in answers for domain in answer.left_out}.values():
         REMARKS.print(f"{domain.domain} is left out: {domain.detail}", soft_wrap=True)
 

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from deepsimbad.evaluators.grey_levels import GreyLevels
 from deepsimbad_client.errors import InvalidArgumentError
-from deepsimbad_client.recordings import MOST_LEFT_OUT, LeftOut, Recording, left_out_lines, read_file
+from deepsimbad_client.recordings import MOST_LEFT_OUT, LeftOut, Recording, first_names, left_out_lines, read_file
 from deepsimbad_client.recordings.annotations import ANNOTATION_SUFFIXES, as_taken
 from deepsimbad_client.recordings.folder import single
 from deepsimbad_client.recordings.sources import RECORDING_SUFFIXES, one_turn, open_source
@@ -110,6 +110,13 @@ def tell_left_out(names: Mapping[str, Sequence[str]], recording: str, *, verbose
     """Write to standard error which frames of a recording are left out."""
     for line in left_out_lines(names, verbose=verbose):
         click.echo(f"{recording}: {line}", err=True)
+
+
+def tell_warnings(view_warnings: Sequence[tuple[str, Sequence[str]]]) -> None:
+    """Write to standard error what is told of views, given by name: each warning once, with the first of its views."""
+    for warning in dict.fromkeys(warning for _, warnings in view_warnings for warning in warnings):
+        names = [name for name, warnings in view_warnings if warning in warnings]
+        click.echo(f"warning: {warning}: {len(names)} of {len(view_warnings)} ({first_names(names)})", err=True)
 
 
 def views(

@@ -61,6 +61,7 @@ from deepsimbad_client.recordings.options import (
     reading,
     rotate_option,
     tell_left_out,
+    tell_warnings,
     views,
 )
 
@@ -285,6 +286,7 @@ def localize(domain: str, images: tuple[str, ...], rotate: int | None, as_json: 
         frame = belief["top"][0]["frame"] or f"image {belief['top'][0]['map_image']}"
         table.add_row(name, frame, f"{belief['mode_m']:.1f} m", mean, interval, f"{belief['entropy_bits']:.1f} bit")
     print_table(table)
+    tell_warnings([(name, answer["warnings"]) for name, answer in answers])
 
 
 def _view_in(

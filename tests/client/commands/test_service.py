@@ -4,6 +4,7 @@ import json
 import re
 import threading
 
+import cv2
 import numpy as np
 import pytest
 
@@ -179,9 +180,11 @@ def test_places_on_the_command_line(client, encodings, tmp_path, command, out, e
     assert [answer["belief"]["top"][0]["frame"] for answer in answers] == ["4.png", "1.png", "2.png"]
     (answer,) = out("localize", "--json", "--domain", "route", f"{encodings / 'summer.npy'}#7:8")
     assert answer["retrieval"][0]["map_image"] == 7
-    printed = out(*localize, folder / "4.png")
-    assert "likeliest [m]" in printed
-    assert re.search(r"4\.png +│ 4\.png +│ +4\.0", printed), printed
+    cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((48, 64), np.uint8))
+    result = command(*localize, folder / "4.png", tmp_path / "dark.png")
+    assert (result.code, "likeliest [m]" in result.out) == (0, True)
+    assert re.search(r"4\.png +│ 4\.png +│ +4\.0", result.out), result.out
+    assert f"warning: the view told nothing of the place: 1 of 2 ({tmp_path / 'dark.png'})\n" in result.err
     client.admin.warm("places")
     for domains in ("places,route", "*"):
         (anywhere,) = out("localize", "--json", domains, folder / "4.png")
