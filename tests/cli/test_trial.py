@@ -1,6 +1,7 @@
 """`deepsimbad try`: two drives in, figures and a page out."""
 
 import json
+import os
 import re
 import shutil
 from base64 import b64decode
@@ -159,6 +160,17 @@ def test_ready_encodings_have_figures_and_a_page_without_pictures(deepsimbad, dr
     np.save(tmp_path / "truth.npy", np.array([[-1]]))
     none = json.loads(deepsimbad("try", *far, "--ground-truth", tmp_path / "truth.npy", "--json").out)
     assert (none["n_queries"], none["anr"]["composed"]) == (0, None)
+
+
+def test_names_that_are_no_utf_8_are_shown_in_page_and_json(deepsimbad, pictures, tmp_path):
+    queries = tmp_path / os.fsdecode(b"f\xfcnf")
+    queries.mkdir()
+    shutil.copy(pictures / "7.png", queries / os.fsdecode(b"pl\xe4tze.png"))
+    ran = deepsimbad("try", pictures, queries, *QUICK, "--out", "out", "--json", "trial.json")
+    assert ran.code == 0, ran.err
+    assert json.loads((tmp_path / "trial.json").read_text())["config"]["queries"] == str(queries)
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert ("f\ufffdnf" in text, "pl\ufffdtze.png" in text) == (True, True)
 
 
 def test_queries_that_the_map_was_made_of_are_warned_of_in_the_page_too(deepsimbad, drives, tmp_path):

@@ -7,13 +7,14 @@ output, progress and remarks to standard error.
 import os
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 
 import click
 
 from deepsimbad_campus.__main__ import campus_command
 from deepsimbad_client.commands import admin, recordings
 from deepsimbad_client.commands.console import show_waits
-from deepsimbad_client.errors import DeepSimbadClientError
+from deepsimbad_client.errors import DeepSimbadClientError, NotSavedError
 
 DONE, FAILED, CANCELLED = 0, 1, 130
 RESUMABLE = {"upload", "replay", "download", "campus"}
@@ -58,6 +59,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line, by default that of the process; returns its exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     show_waits()
+    if isinstance(sys.stdout, TextIOWrapper):  # as standard error does: a name that it cannot show ends no command
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = cli.main(words, prog_name="deepsimbad-client", standalone_mode=False)
     except DeepSimbadClientError as error:
@@ -72,5 +75,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return CANCELLED
     except BrokenPipeError:  # the reader of the output has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        sys.stderr.write(f"deepsimbad-client: {NotSavedError.code}: {error}\n")
         return FAILED
     return code if isinstance(code, int) else DONE

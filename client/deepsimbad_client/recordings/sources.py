@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_client.errors import InvalidArgumentError, SourceError
+from deepsimbad_client.http import text_of
 from deepsimbad_client.recordings import TURNS, Frame, Recording, finite_number
 from deepsimbad_client.recordings.bag import BAG_PREFIX, BAG_SUFFIXES, METADATA, read_bag
 from deepsimbad_client.recordings.benchmarks import open_benchmark, open_recognised
@@ -86,6 +87,9 @@ def open_source(
     place, part = split_slice(source)
     options = _Options(spacing_m, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
     recording = _open_whole(place, options)
+    recording = dataclasses.replace(
+        recording, name=text_of(recording.name)
+    )  # a file's name may be none that can be written
     _check_options(recording, options)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:

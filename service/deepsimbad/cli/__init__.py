@@ -4,9 +4,11 @@ Exit codes: 0 done, 1 a named error (one line on standard error, `deepsimbad: CO
 """
 
 import logging
+import sys
 from collections import UserDict
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from typing import Any
 
 import click
@@ -48,6 +50,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     # Only `serve` writes a log; elsewhere an error is one line, without the trace that a library logs beside it.
     logging.getLogger("deepsimbad").addHandler(logging.NullHandler())
+    if isinstance(sys.stdout, TextIOWrapper):  # as standard error does: a name that it cannot show ends no command
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = deepsimbad.main(args=None if arguments is None else list(arguments), standalone_mode=False)
     except CancelledError as error:

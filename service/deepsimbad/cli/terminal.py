@@ -226,8 +226,8 @@ def write_json(document: Any, file: Path | None = None) -> None:
     text = json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
     if file is None:
         click.echo(text)
-    else:
-        file.write_text(text + "\n", encoding="utf-8")
+    else:  # of a file's name that is not UTF-8, what standard error shows of it, which JSON reads as the same name
+        file.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _finite(value: Any) -> Any:
@@ -248,5 +248,5 @@ def render(file: Path, template: str, **values: Any) -> Path:
         keep_trailing_newline=True,
     )
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(templates.get_template(template).render(**values), encoding="utf-8")
+    file.write_text(templates.get_template(template).render(**values), encoding="utf-8", errors="backslashreplace")
     return file

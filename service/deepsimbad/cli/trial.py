@@ -206,7 +206,7 @@ class Album:
 
     def entry(self, row: int) -> dict[str, Any]:
         """A frame as the page shows it: its `name`, and its `picture` or None."""
-        return {"name": self._frames[row].name, "picture": self._picture(row) if self.has_pictures else None}
+        return {"name": self._frames[row].stored_name, "picture": self._picture(row) if self.has_pictures else None}
 
     def _picture(self, row: int) -> dict[str, Any] | None:
         """A small copy of a frame: `uri`, `width` and `height`."""

@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 
 import deepsimbad_client
+from deepsimbad.cli import deepsimbad as service_cli
 from deepsimbad.cli import run as service_run
 from deepsimbad_client.commands import cli, console, run
 from deepsimbad_client.commands.console import JobBar, domain_table, job_table, show, show_waits
@@ -138,3 +139,21 @@ def test_a_ctrl_c_says_whether_the_same_command_goes_on(monkeypatch, capsys, com
     assert run([command]) == 130
     advice = "; the same command goes on where it stopped" if goes_on else ""
     assert capsys.readouterr().err == f"deepsimbad-client: cancelled{advice}\n"
+
+
+def test_an_error_of_the_system_is_one_line(monkeypatch, capsys):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cli, "main", full)
+    assert run(["replay"]) == 1
+    assert capsys.readouterr().err == "deepsimbad-client: not_saved: [Errno 28] No space left on device\n"
+
+
+@pytest.mark.parametrize(("run_", "group"), [(run, cli), (service_run, service_cli)])
+def test_a_name_that_standard_output_cannot_show_ends_no_command(monkeypatch, run_, group):
+    out = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr("sys.stdout", out)
+    monkeypatch.setattr(group, "main", lambda *_, **__: print("pl\udce4tze.jpg, plätze.jpg", flush=True))
+    assert run_([]) == 0
+    assert out.buffer.getvalue() == b"pl\\udce4tze.jpg, pl\\xe4tze.jpg\n"
