@@ -73,7 +73,7 @@ def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None
         u = unit_encodings(query.encoding, statistics.encodings or map_statistics.encodings, model.get("projection"))
         return np.asarray(u @ model["prototypes"].T, np.float32)
     if products is None:
-        z = -statistics.ranks.view(query.ranks).z
+        z: NDArray[np.floating] = -statistics.ranks.view(query.ranks).z
     elif live is None or live.products is None:
         return products
     else:
