@@ -73,14 +73,14 @@ def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None
         u = unit_encodings(query.encoding, statistics.encodings or map_statistics.encodings, model.get("projection"))
         return np.asarray(u @ model["prototypes"].T, np.float32)
     if products is None:
-        z: NDArray[np.floating] = -statistics.ranks.view(query.ranks).z
+        z = -statistics.ranks.view(query.ranks).z
     elif live is None or live.products is None:
         return products
     else:
         z = (products - live.products.mean) / live.products.std
     estimates = map_statistics.products.mean + map_statistics.products.std * z
-    u = estimates @ map_.fit_to_landmarks
-    return np.asarray(u @ map_.landmark_model["prototypes"].T, np.float32)
+    vector = estimates @ map_.fit_to_landmarks
+    return np.asarray(vector @ map_.landmark_model["prototypes"].T, np.float32)
 
 
 def _rrf(map_: Map, query: Query, _: LiveStatistics | None) -> NDArray[np.float32]:
