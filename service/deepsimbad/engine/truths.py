@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deepsimbad.core.experience.nnql import FARTHEST_TRUTH_M
 from deepsimbad.core.localizer import LocalizerState
 from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.route import Route
@@ -18,7 +19,6 @@ from deepsimbad.engine.worker import InferenceWorker
 from deepsimbad.errors import InvalidInputError
 from deepsimbad.store.sessions import JournalRow, ObservedRow, SessionRecord, SessionStore, StateSnapshot
 
-_FARTHEST_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
 _MOST_RESUMABLE = 16  # sessions, 0.5 MB each at 26,000 map images
 
 
@@ -145,7 +145,7 @@ class Truths:
         if numbers.size:
             await self._follow(record, engine, numbers[0], numbers[-1], rank)
         apart_m = np.abs(route.offset_m(route.position_m[nearest_images], truth_m))
-        share[~(apart_m <= _FARTHEST_M)] = np.nan  # unknown ones too
+        share[~(apart_m <= FARTHEST_TRUTH_M)] = np.nan  # unknown ones too
         return RankedTruths(record, truth_m, share, None if true_map_images is None else retrieval, first)
 
     async def keep(

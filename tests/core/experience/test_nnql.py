@@ -147,6 +147,9 @@ def test_moves_that_are_no_action_or_lead_nobody_knows_where_teach_nothing(world
     true_m[5] = np.nan
     moves = transitions_of(map_, walk_of(ranks, frames, true_position_m=true_m), NnqlConfig())
     assert moves.action.tolist() == [2, 0, 0]
+    true_m[1], true_m[3] = N + 8.9, N + 9.1  # 10 m past the end are of a place of the map still
+    moves = transitions_of(map_, walk_of(ranks, frames, true_position_m=true_m), NnqlConfig())
+    assert moves.action.tolist() == [2, 0]
     for action_m, actions in ((2.5, [1]), (2.51, [])):  # half a step is near enough
         walk = walk_of(ranks, [4, 6], action_m=np.array([0.0, action_m]))
         assert transitions_of(map_, walk, NnqlConfig()).action.tolist() == actions

@@ -20,6 +20,8 @@ from deepsimbad.core.metrics import rank_of_truth
 from deepsimbad.core.relevance import Query, UpdateRule
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
+FARTHEST_TRUTH_M = 10.0  # a truth farther from every map image is of no place of the map: another road, another frame
+
 
 @dataclass(frozen=True)
 class NnqlConfig:
@@ -140,7 +142,8 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
     Where a move leads past the end the session begins anew, with the statistics that it has.
 
     A move counts for the domain's action nearest to it, if that is no farther than half the least step between two
-    actions (of a single action, than half of it). Other moves, and those to an unknown place, teach nothing.
+    actions (of a single action, than half of it). Other moves, and those to an unknown place or to none of the map,
+    teach nothing.
     """
     actions_m, route = map_.actions_m, map_.route
     reach_m = np.diff(actions_m).min() / 2 if actions_m.size > 1 else abs(actions_m[0]) / 2
@@ -152,11 +155,12 @@ def transitions_of(map_: Map, walk: KnownWalk, config: NnqlConfig) -> Transition
         step, _ = localizer.observe_or_restart(state, query, float(walk.action_m[t]), config.motion_std_m)
         state = step.state
         nearest.append(shortlist(step.relevance, config.n_neighbours))
-        if t == 0 or np.isnan(walk.true_position_m[t]):
+        truth = route.nearest_image(route.wrapped(walk.true_position_m[[t]])).astype(np.int64)
+        off_m = np.abs(route.offset_m(route.position_m[truth], walk.true_position_m[t]))
+        if t == 0 or not off_m[0] <= FARTHEST_TRUTH_M:  # nor where it is unknown
             continue
         action = int(np.abs(actions_m - walk.action_m[t]).argmin())
         if abs(actions_m[action] - walk.action_m[t]) <= reach_m:
-            truth = route.nearest_image(route.wrapped(walk.true_position_m[[t]])).astype(np.int64)
             is_earned = rank_of_truth(state.belief.mass, truth) < config.top_share * route.n_images
             outcomes.append((t, action, config.reward * is_earned))
     views = np.array([view for view, _, _ in outcomes], np.int64)
