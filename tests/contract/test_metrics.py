@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import N_READY, RANKS, image_body, picture, ready_encodings, service
+from .conftest import N_READY, RANKS, image_body, of_one_process, picture, ready_encodings, service
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
 COMMON = {"receive", "wait", "decode", "encode", "describe", "retrieve", "plan", "total"}
@@ -83,6 +83,14 @@ def test_sessions_disk_release_and_process(own_client, tmp_path):
     values = scrape(own_client)
     assert "deepsimbad_sessions" in values, "what can be read is shown"
     assert "deepsimbad_domains" not in values
+
+
+@of_one_process
+def test_the_release_is_the_one_that_runs_whatever_was_installed_since(client, monkeypatch):
+    series = next(name for name in scrape(client) if name.startswith("deepsimbad_build_info"))
+    monkeypatch.setattr("deepsimbad.version", lambda _: "of tomorrow")
+    assert series in scrape(client)
+    assert f'version="{client.get("/").json()["version"]}"' in series
 
 
 def test_a_damaged_map_is_shown_until_it_is_back_or_another_serves(tmp_path):
