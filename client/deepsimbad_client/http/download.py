@@ -54,7 +54,7 @@ async def download(wire: Wire, call: Call, path: Path, on_progress: OnBytes) -> 
                 wait_s = attempts.after_answer(response)
                 if wait_s is None:
                     raise_for_problem(response)
-        except httpx2.TransportError as error:
+        except httpx2.RequestError as error:
             if sum(part.stat().st_size for part in _parts(path)) > n_there:
                 attempts = wire.attempts(call)
             wait_s = attempts.after_failure(error)

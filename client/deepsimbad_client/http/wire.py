@@ -122,7 +122,7 @@ class Attempts:
     n_sent: int = 0
     answer_lost: bool = False  # an earlier try may have been acted on without our hearing of it
 
-    def after_failure(self, error: httpx2.TransportError) -> float:
+    def after_failure(self, error: httpx2.RequestError) -> float:
         """Seconds to wait before the next try; raises TransportError when there is none."""
         self.n_sent += 1
         is_untouched = isinstance(error, UNTOUCHED_FAILURES)
@@ -266,7 +266,7 @@ class Wire:
         while True:
             try:
                 response = await self.link.send(self.request(call))
-            except httpx2.TransportError as error:
+            except httpx2.RequestError as error:
                 wait_s: float | None = attempts.after_failure(error)
             else:
                 wait_s = attempts.after_answer(response)
@@ -304,7 +304,7 @@ class Wire:
                 )
         except httpx2.TimeoutException as error:
             raise TransportTimeoutError(f"{request_text} fell silent: {error or type(error).__name__}") from error
-        except httpx2.TransportError as error:
+        except httpx2.RequestError as error:
             raise TransportError(f"{request_text} broke off: {error or type(error).__name__}") from error
 
 

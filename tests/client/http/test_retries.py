@@ -13,7 +13,7 @@ from deepsimbad_client.http import retry_after_s
 from .scripted import JOB, POLICY, Script, answer
 
 OK = {"status": "alive"}
-FAILURES = (httpx2.ReadTimeout, httpx2.ReadError, httpx2.WriteError, httpx2.RemoteProtocolError)
+FAILURES = (httpx2.ReadTimeout, httpx2.ReadError, httpx2.WriteError, httpx2.RemoteProtocolError, httpx2.DecodingError)
 UNTOUCHED = (httpx2.ConnectError, httpx2.ConnectTimeout, 408, 429, 503)
 PROXIES = (502, 504)
 RETRIED = (*FAILURES, *UNTOUCHED, *PROXIES)
