@@ -14,6 +14,7 @@ import pytest
 
 from deepsimbad.errors import (
     ConflictError,
+    DamagedFileError,
     DamagedMapError,
     DomainDiffersError,
     LostActivationError,
@@ -370,6 +371,21 @@ def test_a_damaged_object_is_refused_and_a_damaged_file_is_fetched_again(
     path.chmod(0o644)
     path.write_bytes(content[:-1] + b"x")
     assert node_b.map_file("campus", 1).read_bytes() == content
+
+
+def test_an_entry_of_another_release_is_named_and_nothing_of_it_is_taken_over(node: MakeNode, add_map: AddMap) -> None:
+    node_a, node_b = node("here"), node("there")
+    make_domain(node_a)
+    add_map(node_a)
+    node_a.activate("campus", 1, ANY)
+    node_b.follow()
+    *_, (position, entry) = node_a.store.entries(0)
+    entry["state"]["map"]["tomorrow"] = 1
+    assert node_a.store.append(position + 1, entry)
+    for _ in range(2):
+        with pytest.raises(DamagedFileError, match=f"entry {position + 1} of the map store's log.*tomorrow"):
+            node_b.follow()
+    assert node_b.domain("campus").active_version == 1
 
 
 def test_a_file_is_fetched_once_however_many_ask(

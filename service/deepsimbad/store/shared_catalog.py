@@ -12,7 +12,14 @@ from typing import Any, TypeAlias, TypeVar
 
 from sqlite_utils import Database
 
-from deepsimbad.errors import ConflictError, DamagedMapError, DomainDiffersError, LostActivationError, NotFoundError
+from deepsimbad.errors import (
+    ConflictError,
+    DamagedFileError,
+    DamagedMapError,
+    DomainDiffersError,
+    LostActivationError,
+    NotFoundError,
+)
 from deepsimbad.store import layout
 from deepsimbad.store.backup import Inspection
 from deepsimbad.store.catalog import Catalog
@@ -160,15 +167,20 @@ class SharedCatalog(Catalog):
         return list(state["domains"])
 
     def _apply(self, position: int, entry: Mapping[str, Any]) -> list[str]:
-        name = str(entry["domain"])
         with self._writing() as db:
             if db.execute("SELECT position FROM map_store").fetchone()[0] != position - 1:
                 return []  # another process was faster
-            if entry["state"] is None:
-                db.execute("DELETE FROM domain WHERE name = ?", [name])
-                db.execute("INSERT OR IGNORE INTO doomed_folder VALUES (?)", [name])
-            else:
-                self._take_over(db, name, entry["state"])
+            try:
+                name = str(entry["domain"])
+                if entry["state"] is None:
+                    db.execute("DELETE FROM domain WHERE name = ?", [name])
+                    db.execute("INSERT OR IGNORE INTO doomed_folder VALUES (?)", [name])
+                else:
+                    self._take_over(db, name, entry["state"])
+            except (KeyError, TypeError) as error:  # as of a newer release on another machine
+                raise DamagedFileError(
+                    f"entry {position} of the map store's log is not of this release, which cannot go on: {error}"
+                ) from error
             db.execute("UPDATE map_store SET position = ?", [position])
         with self._writing() as db:
             self._finish_deletion(db, name)
