@@ -3,8 +3,9 @@
     python -m bench.seasons SOURCE SOURCE SOURCE [SOURCE...]
     python -m bench.seasons --camera FIRST SECOND SOURCE SOURCE [SOURCE...]
 
-SOURCEs are drives of one route in as many seasons; every order of them is measured, the last one driven in one session.
-With --camera maps of one season learn what a season changes from FIRST and SECOND, two drives of another route.
+SOURCEs are drives of one route in as many seasons. Each is driven in one session on maps of every other, to which the
+rest are appended in the order given. With --camera maps of one season learn what a season changes from FIRST and
+SECOND, two drives of another route.
 """
 
 import itertools
@@ -31,7 +32,9 @@ PLAN = MapPlan(Relevance.COMPOSED, 4, ACTIONS_M, same_route=True)
 MOST_LANDMARKS = 300
 MAX_PIXELS = 50_000_000
 TOLERANCE_M = 2.0
-KINDS = ("one season", "one, and one appended", "two from the start", "one, and two appended", "one, and the camera's")
+ONE, BY_CAMERA, FROM_THE_START = "one season", "one, and the camera's", "two from the start"
+APPENDED = ("one, and one appended", "one, and two appended", "one, and three appended")
+KINDS = (ONE, APPENDED[0], FROM_THE_START, *APPENDED[1:], BY_CAMERA)
 
 
 def lines(sources: Sequence[str]) -> Iterator[str]:
@@ -50,8 +53,9 @@ def lines(sources: Sequence[str]) -> Iterator[str]:
 def worlds(sources: Sequence[str]) -> Iterator[tuple[Drive, Iterator[tuple[str, Map]]]]:
     """Every test drive, and the maps that it is driven on."""
     if sources[0] != "--camera":
-        for training, *seasons, test in itertools.permutations(encoded(sources)):
-            yield test, maps(training, seasons)
+        drives = encoded(sources)
+        for training, test in itertools.permutations(drives, 2):
+            yield test, maps(training, [drive for drive in drives if drive not in (training, test)])
         return
     first, second, *drives = encoded(sources[1:])
     camera = (SeenTwice(first, second, same_places(second.route(), first.route())),)
@@ -62,8 +66,8 @@ def worlds(sources: Sequence[str]) -> Iterator[tuple[Drive, Iterator[tuple[str, 
 def by_camera(training: Drive, camera: Sequence[SeenTwice]) -> Iterator[tuple[str, Map]]:
     """Maps of one drive without and with what its camera's seasons taught elsewhere."""
     n_landmarks = min(MOST_LANDMARKS, training.n_frames)
-    yield KINDS[0], compose_map(PLAN, training, None, None, n_landmarks).map
-    yield KINDS[4], compose_map(PLAN, training, None, None, n_landmarks, camera=camera).map
+    yield ONE, compose_map(PLAN, training, None, None, n_landmarks).map
+    yield BY_CAMERA, compose_map(PLAN, training, None, None, n_landmarks, camera=camera).map
 
 
 def encoded(sources: Sequence[str]) -> list[Drive]:
@@ -82,9 +86,9 @@ def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]
     n_landmarks = min(MOST_LANDMARKS, training.n_frames)
     map_ = compose_map(PLAN, training, None, None, n_landmarks).map
     map_ = replace(map_, frame_digest=training.digests())
-    yield KINDS[0], map_
+    yield ONE, map_
     drives = [(training, True)]
-    for kind, season in zip((KINDS[1], KINDS[3]), seasons, strict=False):
+    for kind, season in zip(APPENDED, seasons, strict=False):
         known_drives = KnownDrives.of(map_, drives, training)
         fused = None if known_drives is None else fuse(map_, known_drives, season, same_route=True)[0]
         if fused is None:
@@ -93,7 +97,7 @@ def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]
         drives.append((season, True))
         yield kind, map_
     if seasons:
-        yield KINDS[2], compose_map(PLAN, training, seasons[0], seasons[0], n_landmarks).map
+        yield FROM_THE_START, compose_map(PLAN, training, seasons[0], seasons[0], n_landmarks).map
 
 
 def scores_of(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
@@ -101,7 +105,7 @@ def scores_of(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
     scorer, live = RetrievalScorer(), map_.live_statistics
     truths = true_images_of(test.route(), map_.route, TOLERANCE_M)
     for encoding, truth in zip(test.encodings, truths, strict=True):
-        view = Query(np.ones(map_.n_landmarks, np.float32), encoding=encoding)
+        view = Query(np.arange(1.0, map_.n_landmarks + 1, dtype=np.float32), encoding=encoding)
         live = live if stateless or live is None else live.observing(view)
         scorer.add(relevances(map_, view, live), truth)
     return scorer.result()
