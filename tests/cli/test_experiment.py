@@ -216,10 +216,11 @@ def test_a_test_drive_that_was_learnt_from_is_warned_of_whatever_it_is_called(me
         *(("vpr", options, 1) for options in ("--n-landmarks 99", "--list-length 41", "--ground-truth nowhere.npy")),
         *(("nbv", options, 1) for options in ("--n-landmarks 131", "--list-length 41", "--test {test}#:90")),
         *(("nbv", options, 2) for options in ("--episodes 1", "--seed -1", "--update none", "--relevance none")),
-        ("vpr", "--training a.npy", 1),
+        *(("vpr", options, 1) for options in ("--training a.npy", "--landmarks wide.npy", "--test wide.npy")),
     ],
 )
 def test_named_errors_and_wrong_usage(deepsimbad, triplet, route, tmp_path, kind, options, code):
+    np.save(tmp_path / "wide.npy", np.random.default_rng(3).normal(size=(80, 99)))  # from another encoder
     sources = (*triplet, *READY) if kind == "vpr" else (*route, *QUICK)
     ran = deepsimbad("experiment", kind, *sources, *options.format(test=route[-1]).split(), "--data-dir", "some")
     assert (ran.code, ran.out) == (code, ""), ran.err

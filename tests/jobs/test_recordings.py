@@ -105,7 +105,7 @@ def test_a_run_that_is_killed_has_kept_what_it_encoded_now_and_then(tmp_path, mo
     [
         ("#2:3", {}, InvalidSourceError, "no frame that can be used"),
         ("", {"max_pixels": 100}, ImageTooLargeError, "pixels"),
-        ("", {"evaluator": READY}, InvalidSourceError, "ready encodings alone"),
+        ("", {"evaluator": READY}, InvalidSourceError, "^test_what.*: this evaluator takes ready encodings alone"),
     ],
     ids=["broken frames alone", "an image over the limit", "no extractor"],
 )

@@ -137,14 +137,16 @@ class _Space:
         on_progress: Callable[[float], None],
     ) -> Self:
         """The space before seasons are known, with landmarks chosen from a drive or those of another map's model."""
+        d = candidates.encoding_dim if isinstance(candidates, Drive) else candidates["usual"].shape[1]
+        if d != training.encoding_dim:
+            raise InvalidEncodingError(
+                f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}: "
+                "they come from another encoder"
+            )
         if isinstance(candidates, Drive):
             drives = {id(drive): drive.encodings for drive in (training, candidates)}
             directions = principal_directions(*drives.values(), halves=halves, on_progress=on_progress)
             return cls.among(candidates, directions, n_landmarks)
-        if (d := candidates["usual"].shape[1]) != training.encoding_dim:
-            raise InvalidEncodingError(
-                f"encodings of {training.encoding_dim} numbers cannot be compared with landmarks of {d}"
-            )
         return cls(candidates.get("projection"), np.asarray(candidates["prototypes"], np.float32))
 
     @classmethod

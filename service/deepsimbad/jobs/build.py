@@ -192,7 +192,9 @@ def _encode_images(
         Places of the n frames that could be read, [n, d] encodings, [n] which show nothing, median ms of an image.
     """
     if not evaluator.forms or evaluator.encoding_dim is None:
-        raise InvalidSourceError("this evaluator takes ready encodings alone; give a .npy or .csv file")
+        raise InvalidSourceError(
+            f"{recording.name}: this evaluator takes ready encodings alone; give a .npy or .csv file"
+        )
     n_frames = len(recording.frames)
     encodings = np.empty((n_frames, evaluator.encoding_dim), np.float32)
     shows_nothing = np.zeros(n_frames, np.bool_)
