@@ -346,6 +346,18 @@ def test_limits_expiry_and_metrics(tmp_path):
         client.begin()
 
 
+def test_whatever_breaks_a_sweep_the_next_one_comes(tmp_path, monkeypatch):
+    moments_s = []
+
+    async def sweep():
+        moments_s.append(time.monotonic())
+        raise RuntimeError("can't start new thread")
+
+    with service(tmp_path, session_sweep_s=0.05) as client:
+        monkeypatch.setattr(client.services.sessions, "sweep", sweep)
+        wait_until(lambda: len(moments_s) > 1)
+
+
 def test_a_restart_and_a_retired_map(tmp_path):
     key = {"Idempotency-Key": "k"}
     begin_under_key = {"json": {}, "headers": {"Idempotency-Key": "once"}}

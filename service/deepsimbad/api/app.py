@@ -193,7 +193,7 @@ async def _keep_following(services: Services) -> None:
         await asyncio.sleep(_FOLLOW_S)
         try:
             await follow(services)
-        except DeepSimbadError as error:
+        except Exception as error:  # whatever it is, the next try may succeed
             if not is_failing:
                 log.warning("the map store cannot be followed", exc_info=error)
             is_failing = True
@@ -219,7 +219,7 @@ async def _sweep(services: Services) -> None:
 
             await services.sessions.end_those(is_over)
             await run_sync(services.retention.prune)
-        except DeepSimbadError:
+        except Exception:  # as above
             log.exception("expired sessions could not be ended")
 
 
