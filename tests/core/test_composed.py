@@ -156,6 +156,18 @@ def test_two_seasons_teach_and_one_does_not(seasons):
         outcome.map.check()
 
 
+def test_a_season_counts_at_a_place_by_all_its_frames_there(seasons):
+    twice_m = np.repeat(np.arange(160.0), 2)
+    pairs = np.stack([seasons[0], seasons[2]])  # of frames at every place, in one order and in the other
+    first, second = (
+        compose_map(
+            PLAN, drive_of(seasons[1]), drive_of(np.concatenate(frames, axis=1).reshape(-1, 24), twice_m), None, 100
+        )
+        for frames in (pairs, pairs[::-1])
+    )
+    assert first.places == pytest.approx(second.places, abs=1e-5)
+
+
 def test_places_that_look_alike_tell_less(seasons):
     """A stretch that comes again stands out less than one that does not, by two seasons and by one."""
     twice = [np.concatenate([season[:40], season[:120]]) for season in seasons[:2]]

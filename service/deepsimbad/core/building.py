@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.composed import (
     LEAST_SHARED_PLACES,
-    SECOND_SEASON_WEIGHT,
     Moments,
     compose,
     described,
     learnt_landmarks,
     principal_directions,
+    season_seen,
     unit,
     within_place_whitening,
 )
@@ -238,9 +238,8 @@ def compose_map(
     moments, places = Moments.of(training.encodings), space.unit_vectors(training)
     fused_places = places
     if season is not None and other is not None:
-        moments, fused_places = Moments.of(training.encodings, other.encodings), places.copy()
-        images, frames = season.places.T
-        fused_places[images] = unit(places[images] + SECOND_SEASON_WEIGHT * space.unit_vectors(other)[frames])
+        moments = Moments.of(training.encodings, other.encodings)
+        fused_places = unit(places + season_seen(space.unit_vectors(other), season.places, len(places)))
     landmark_images = space.candidate_frames if candidates is training else None
     if candidates is second and season is not None and space.candidate_frames is not None:
         landmark_images = _images_of(season.places, space.candidate_frames)

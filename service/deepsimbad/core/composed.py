@@ -132,6 +132,17 @@ def standardised(encodings: NDArray[np.float32], moments: Moments) -> NDArray[np
     return np.where(np.isnan(deviations), np.float32(0), deviations)
 
 
+def season_seen(u: NDArray[np.float32], places: NDArray[np.int64], n_images: int) -> NDArray[np.float32]:
+    """[n, k] what a second season adds to every map image: the weighted mean of its frames [m, k] there.
+
+    Args:
+        places: [p, 2] pairs (map image, frame) of the same place.
+    """
+    sums, n_frames = np.zeros((n_images, u.shape[1]), np.float32), np.bincount(places[:, 0], minlength=n_images)
+    np.add.at(sums, places[:, 0], u[places[:, 1]])
+    return np.asarray(SECOND_SEASON_WEIGHT * (sums / np.maximum(n_frames, 1)[:, np.newaxis]), np.float32)
+
+
 def described(
     encodings: NDArray[np.float32], moments: Moments, projection: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:

@@ -23,12 +23,12 @@ from deepsimbad.core.building import (
 )
 from deepsimbad.core.composed import (
     LEAST_SHARED_PLACES,
-    SECOND_SEASON_WEIGHT,
     Moments,
     compose,
     described,
     learnt_landmarks,
     principal_directions,
+    season_seen,
     unit,
     within_place_whitening,
 )
@@ -174,7 +174,7 @@ class FusedMap:
     def without(self, withheld_frames: NDArray[np.int64]) -> Map:
         """The map as it would be without the drive's withheld frames."""
         pairs = self.pairs[~np.isin(self.pairs[:, 1], withheld_frames)]
-        places = unit(self.season_sums + _season(self.u, pairs, self.base.n_images))
+        places = unit(self.season_sums + season_seen(self.u, pairs, self.base.n_images))
         landmarks = learnt_landmarks(places, self.landmarks, self.base.list_length)
         base = replace(self.base, landmark_model={**self.base.landmark_model, "prototypes": landmarks})
         return _with_new(
@@ -237,8 +237,8 @@ def fuse(
     u = [_units(row, whitening) for row in rows]
     season_sums = _units(map_rows, whitening)
     for units, places_seen in zip(u[:-1], pairs[:-1], strict=True):
-        season_sums = season_sums + _season(units, places_seen, map_.n_images)
-    places = unit(season_sums + _season(u[-1], pairs[-1], map_.n_images))
+        season_sums = season_sums + season_seen(units, places_seen, map_.n_images)
+    places = unit(season_sums + season_seen(u[-1], pairs[-1], map_.n_images))
     initial_landmarks, prototypes = prototypes, learnt_landmarks(places, prototypes, map_.list_length)
     moments = Moments.of(*(season_drive.encodings for season_drive in seasons))
     model = {**map_.landmark_model, "prototypes": prototypes, "usual": moments.mean_std()}
@@ -269,13 +269,6 @@ def _dissimilarities(
     rows: NDArray[np.float32], whitening: NDArray[np.float64] | None, prototypes: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     return np.asarray(np.clip(2 - 2 * _units(rows, whitening) @ prototypes.T, 0, 4), np.float32)
-
-
-def _season(u: NDArray[np.float32], places: NDArray[np.int64], n_images: int) -> NDArray[np.float32]:
-    """What a season adds to every place, [n, k]: the weighted direction of its frames there."""
-    sums = np.zeros((n_images, u.shape[1]), np.float32)
-    np.add.at(sums, places[:, 0], u[places[:, 1]])
-    return np.asarray(SECOND_SEASON_WEIGHT * unit(sums), np.float32)
 
 
 def _lists(map_: Map, places: NDArray[np.float32]) -> NDArray[np.uint16]:
