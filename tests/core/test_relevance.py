@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepsimbad.core.composed import Moments
 from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
 from deepsimbad.core.index.retrieval import relevances, shortlist, sum_listed
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.relevance import Query, Relevance, most_strange, strangeness
 from deepsimbad.errors import InvalidInputError, InvalidMapConfigError
 
 from .conftest import a_map
@@ -100,3 +101,18 @@ def test_a_batch_of_views_says_what_each_says_alone(relevance, scene):
             if relevance is not Relevance.BRUTE_FORCE:  # of which one matrix product rounds as it likes
                 assert np.array_equal(batch[e], expected)
                 assert shortlist(batch, 3)[e].tolist() == shortlist(expected, 3).tolist()
+
+
+def test_a_short_drive_knows_little_of_what_is_strange():
+    rng = np.random.default_rng(3)
+    views = rng.normal(size=(4000, 300))
+    # A share of 3 in 16 and three of its standard deviations, and of few views what Student's t adds to 2 in 44
+    assert most_strange(views[:2000]) == pytest.approx(0.2551, abs=1e-3)
+    assert most_strange(views[:5]) == pytest.approx(0.2551 + 0.1419 - 0.0455, abs=0.01)
+    assert most_strange(np.zeros((1, 300))) == most_strange(np.ones((9, 300))) == pytest.approx(0.5606, abs=1e-3)
+    # Neighbours that are alike teach once: each is the mean of nine views, so that 40 are worth some five
+    drive = np.apply_along_axis(np.convolve, 0, views, np.ones(9) / 9, mode="valid")
+    assert most_strange(drive[:40]) == pytest.approx(most_strange(views[:5]), abs=0.03)
+    shares = [strangeness(drive[at + 40 : at + 80], Moments.of(drive[at : at + 40])) for at in range(0, 3600, 90)]
+    excess = np.mean(shares) - 0.0455
+    assert excess == pytest.approx(most_strange(drive[:40]) - most_strange(views[:2000]), abs=0.03)

@@ -285,14 +285,10 @@ def taught(
     arrays = rehearsed(rehearsal, dissimilarities, season)
     map_, rehearsal = replace(map_, **arrays), replace(rehearsal, **arrays)
     views = own_views(map_, places)
-    first_encodings, *other_encodings = (drive.encodings for drive in drives)
-    strangest = max(
-        [most_strange(first_encodings), *(most_strange(first_encodings, other) for other in other_encodings)]
-    )
     arrays = {
         "view_bits": view_bits(map_, views, rehearsal, season),
         "coverage": placed_rightly(rehearsal, views, season),
-        "most_strange": np.array([strangest]),
+        "most_strange": np.array([most_strange(*(drive.encodings for drive in drives))]),
     }
     return replace(map_, **arrays), replace(rehearsal, **arrays)
 

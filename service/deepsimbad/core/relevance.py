@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ class Relevance(StrEnum):
 DEFAULT_RELEVANCE = Relevance.COMPOSED
 FAR_STD = 2.0  # standard deviations from the mean, beyond which a number of an encoding is far off
 _MOST_FAR = 3 / 16  # share of a view's numbers; where it shows a place, in whatever season, fewer are far off
+_MOST_FRAMES = 512  # by which it is judged how much of a drive's frames is new
 _SEASON_VIEWS, _SEASON_VARIETY = 10.0, 0.65  # number and variety from which a session's views may be of an odd season
 _ODDEST_SEASON = 1.5  # times the strangeness from which a view shows nothing, up to which it may be of an odd season
 _FARTHEST = np.float32(4.001)  # squared distance of opposite unit vectors, and its rounding
@@ -137,21 +139,52 @@ def strangeness(encodings: NDArray[np.floating], moments: Moments) -> NDArray[np
     return np.asarray(is_far.mean(axis=-1))
 
 
-def most_strange(first: NDArray[np.float32], second: NDArray[np.float32] | None = None) -> float:
+def most_strange(first: NDArray[np.float32], *seasons: NDArray[np.float32]) -> float:
     """The strangeness from which on a view shows nothing of a route.
 
-    Views of places, in whatever season, have fewer numbers far off than noise, glare and the dark do: at most 3 in 16,
-    and three standard deviations of that share by chance. Where a second season was stranger to the first, its own
-    strangeness is the least.
+    Views of places, in whatever season, have fewer numbers far off than noise, glare and the dark do. A short drive
+    knows less than it seems of how far they lie apart, and what that adds by chance is added. Where another season was
+    stranger to the first, its own strangeness is the least.
 
     Args:
         first: [n, d] encodings of the route.
-        second: [m, d] of another season; None: there is none.
+        seasons: [m, d] of each other season that is known.
     """
-    by_default = _MOST_FAR + 3 * float(np.sqrt(_MOST_FAR * (1 - _MOST_FAR) / first.shape[1]))
-    if second is None:
-        return by_default
-    return max(by_default, float(np.quantile(strangeness(second, Moments.of(first)), 0.99)))
+    by_chance = _far_share(_independent_views(first)) - 2 * NormalDist().cdf(-FAR_STD)
+    strangest = [float(np.quantile(strangeness(season, Moments.of(first)), 0.99)) for season in seasons]
+    return max(_most_far(first.shape[1]) + by_chance, *strangest, 0.0)
+
+
+def _most_far(d: int) -> float:
+    """At most 3 numbers in 16 are far off where a place is shown, and three standard deviations of that share of d."""
+    return _MOST_FAR + 3 * float(np.sqrt(_MOST_FAR * (1 - _MOST_FAR) / d))
+
+
+def _far_share(n_views: float) -> float:
+    """How many numbers of a view are far off, on average, from the mean and deviation of so many views like it.
+
+    They follow Student's distribution with n - 1 degrees of freedom, a deviation wider by sqrt(1 + 1 / n); its tail is
+    that of a normal score by Wallace's approximation (Ann. Math. Statist. 30, 1959).
+    """
+    freedom = n_views - 1
+    score = np.sqrt(freedom * np.log1p(FAR_STD**2 / (1 + 1 / n_views) / freedom))
+    return 2 * NormalDist().cdf(-float(score * (8 * freedom + 1) / (8 * freedom + 3)))
+
+
+def _independent_views(encodings: NDArray[np.float32]) -> float:
+    """How many views that are nothing alike tell as much as a drive's [n, d], whose neighbours are alike; at least 2.
+
+    n by 1 + 2 sum of the autocorrelation along the drive, up to where it ends.
+    """
+    frames = encodings[:: -(-len(encodings) // _MOST_FRAMES)]
+    deviations = frames - frames.mean(axis=0)
+    deviations /= max(float(np.abs(deviations).max()), 1e-30)
+    products = deviations @ deviations.T
+    covariance = np.array([np.trace(products, offset=lag) for lag in range(len(frames))])
+    n_alike = int(np.argmax(np.append(covariance, 0.0) <= 0))
+    if n_alike == 0:
+        return 2.0
+    return max(2.0, len(frames) / float(2 * covariance[:n_alike].sum() / covariance[0] - 1))
 
 
 def is_strange(encoding: NDArray[np.float32], map_moments: Moments, live: Moments | None, threshold: float) -> bool:
@@ -193,7 +226,7 @@ def shows_nothing(blocks: Callable[[], Iterable[NDArray[np.float32]]]) -> NDArra
         blocks: Yields its encodings in blocks [_, d]; called twice.
     """
     moments = Moments.of_blocks(blocks())
-    masks = [strangeness(block, moments) > most_strange(block) for block in blocks()]
+    masks = [strangeness(block, moments) > _most_far(block.shape[1]) for block in blocks()]
     return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
 
 
