@@ -231,8 +231,7 @@ def report() -> Iterator[str]:
     yield from accuracy(all_cases)
     yield from (
         "",
-        f"What falls short: accuracy is measured up to r = {_NUMBERS[-1]} and 600 places. How many landmarks a route "
-        f"of {_LENGTHS[-1]:,} images wants is not known, only how long it takes to choose them.",
+        "Longer routes: [long-route.md](long-route.md).",
     )
     yield from ("", f"## Time to choose {_N_LANDMARKS}, made-up encodings of {composed.MOST_DIMENSIONS} numbers", "")
     yield from times()
