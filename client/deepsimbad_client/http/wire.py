@@ -60,7 +60,7 @@ def http_settings(url: str | None, api_key: str | None, timeout: httpx2.Timeout)
 
     Raises InvalidArgumentError (no http(s) address, or a key that no header can carry).
     """
-    url = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+    url = (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/").removesuffix("/v1")  # which calls begin with
     try:
         parsed_url = httpx2.URL(url)
     except httpx2.InvalidURL as error:

@@ -155,12 +155,12 @@ def test_address_and_key_from_the_environment(monkeypatch):
     monkeypatch.setenv("DEEPSIMBAD_API_KEY", "from-environment")
     with script.client(None) as client:
         assert client.domains() == ()
-    script.client("http://here", "given").domains()
+    script.client("http://here/v1/", "given").domains()
     bare, environment, explicit = script.requests
     assert "authorization" not in bare.headers
     assert environment.url == "http://elsewhere:81/below/v1/domains?limit=200"
     assert environment.headers["authorization"] == "Bearer from-environment"
-    assert (explicit.url.host, explicit.headers["authorization"]) == ("here", "Bearer given")
+    assert (explicit.url, explicit.headers["authorization"]) == ("http://here/v1/domains?limit=200", "Bearer given")
 
 
 def test_arrays_travel_as_npz_and_npy():
