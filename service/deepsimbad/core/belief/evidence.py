@@ -42,7 +42,7 @@ class ViewEvidence:
     rule: UpdateRule
     # [n] log-likelihoods but for a constant, of mean 0; or the weights that additive rules add
     values: NDArray[np.float64]
-    shared_error: float = 0.0  # c', share of its error that is that of the view before; 0 of a first view
+    shared_error: float = 0.0  # c', share of its error that is that of the view before; counts where there was one
 
     @classmethod
     def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared_error: float = 0.0) -> Self:
