@@ -139,6 +139,9 @@ def begin(start, streams):
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
     os.closerange(3, max(streams) + 1)
+    # Streams know whether their file can be sought, so they are opened anew
+    sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - until it ends
+    sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115
     if start["group"] != -1:
         os.setpgid(0, start["group"])
     os.chdir(start["folder"])

@@ -152,7 +152,7 @@ def test_a_geopose_where_the_domain_has_an_anchor(client, domain):
     assert answer.headers["content-type"] == "application/geopose+json"
     place = client.post(path, json=RANKS).json()["belief"]["top"][0]
     # y leads east, x south: a metre of each, by the meridian and the parallel there
-    metre_lat, metre_lon = 1 / 111_077.0, 1 / 82_430.0
+    metre_lat, metre_lon = 1 / 111_078.9, 1 / 82_473.9
     position = answer.json()["position"]
     assert position["lat"] == pytest.approx(42.29 - metre_lat * place["x_m"], abs=2e-7)
     assert position["lon"] == pytest.approx(-83.71 + metre_lon * place["y_m"], abs=2e-7)

@@ -106,12 +106,12 @@ def test_a_job_is_followed_to_its_end(streams, answers, heard):
     ("status", "code", "error", "words"),
     [
         (401, "unauthorized", errors.UnauthorizedError, "API_KEY"),  # the key was revoked meanwhile
-        (403, "forbidden", errors.ForbiddenError, "keys create"),
+        (403, "forbidden", errors.ForbiddenError, "keys create --scope admin"),
         (404, "unknown_job", errors.UnknownJobError, "no job 7"),
     ],
 )
 def test_a_refusal_ends_it(status, code, error, words):
-    refused = answer(status, {"code": code, "detail": "no job 7"})
+    refused = answer(status, {"code": code, "detail": "no job 7", "needed": "admin"})
     with pytest.raises(error, match=words):
         Service([refused], [refused]).follow()
 
