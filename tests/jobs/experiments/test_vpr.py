@@ -101,9 +101,9 @@ def slow_composed(map_rows, queries, candidates, n_landmarks, h):
     drives = [map_rows]
     if len(candidates) == 60:  # those of the route; a frame past the map's end is its last image's within 2 m
         drives.append(candidates)
-        for place, own in enumerate(units):
+        for place, unit_encoding in enumerate(units):
             views = [view for frame, view in enumerate(other[:52]) if min(frame, 49) == place]
-            places[place] = unit(own + 0.8 * np.mean(views, axis=0))
+            places[place] = unit(unit_encoding + 0.8 * np.mean(views, axis=0))
     weights = np.array([1, 0.8, 0.65, 0.5])[:h]
     landmarks = slow_learnt(places, landmarks, weights)
     sums = unit(
