@@ -78,7 +78,7 @@ def products_with_landmarks(map_: Map, query: Query, live: LiveStatistics | None
         return products
     else:
         z = (products - live.products.mean) / live.products.std
-    estimates = map_statistics.products.mean + map_statistics.products.std * z
+    estimates = (map_statistics.products.mean + map_statistics.products.std * z).astype(np.float32)
     vector = estimates @ map_.fit_to_landmarks
     return np.asarray(vector @ map_.landmark_model["prototypes"].T, np.float32)
 
