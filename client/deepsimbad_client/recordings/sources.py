@@ -87,9 +87,7 @@ def open_source(
     place, part = split_slice(source)
     options = _Options(spacing_m, undistortion, rotate, round(time_offset_s * 1e6), on_progress)
     recording = _open_whole(place, options)
-    recording = dataclasses.replace(
-        recording, name=text_of(recording.name)
-    )  # a file's name may be none that can be written
+    recording = dataclasses.replace(recording, name=text_of(recording.name))  # a file's may be none that can be written
     _check_options(recording, options)
     first, last = recording.frames[0], recording.frames[-1]
     if reverse:

@@ -152,7 +152,7 @@ def most_strange(first: NDArray[np.float32], *seasons: NDArray[np.float32]) -> f
     """
     by_chance = _far_share(_independent_views(first)) - 2 * NormalDist().cdf(-FAR_STD)
     strangest = [float(np.quantile(strangeness(season, Moments.of(first)), 0.99)) for season in seasons]
-    return max(_most_far(first.shape[1]) + by_chance, *strangest, 0.0)
+    return max([_most_far(first.shape[1]) + by_chance, *strangest])
 
 
 def _most_far(d: int) -> float:
