@@ -15,12 +15,12 @@
 #
 # builds on NVIDIA's CUDA base with PyPI's PyTorch, which brings CUDA's libraries, about 8 GB.
 #
-# Packages are held to the digests in deploy/requirements-*.txt. Base images are named by their tags; hold them to
-# digests too where builds must repeat: `docker buildx imagetools inspect python:3.11-slim-bookworm` tells one, and
-# `--build-arg PYTHON_IMAGE=python@sha256:...` takes it.
+# Packages are held to the digests in deploy/requirements-*.txt, base images to those beside their tags. A newer base, with
+# Debian's latest fixes, is `--build-arg PYTHON_IMAGE=python:3.11-slim-bookworm@sha256:...`, by the digest that
+# `docker buildx imagetools inspect python:3.11-slim-bookworm` tells.
 ARG VARIANT=cpu
-ARG PYTHON_IMAGE=python:3.11-slim-bookworm
-ARG CUDA_IMAGE=nvidia/cuda:12.8.1-base-ubuntu24.04
+ARG PYTHON_IMAGE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
+ARG CUDA_IMAGE=nvidia/cuda:12.8.1-base-ubuntu24.04@sha256:133c78a0575303be34164d0b90137a042172bdf60696af01a3c424ab402d86e2
 
 # hadolint ignore=DL3006
 FROM ${PYTHON_IMAGE} AS base-cpu

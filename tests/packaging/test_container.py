@@ -61,6 +61,14 @@ def test_the_image_is_what_it_says_and_runs_without_root(tmp_path):
     assert (PROJECT / labels["documentation"]).is_file()
 
 
+def test_every_image_is_held_to_its_digest():
+    arguments = {name: value for argument in STAGES[""].every("ARG") for name, value in pairs(argument.rest).items()}
+    bases = [value for name, value in arguments.items() if name.endswith("_IMAGE")]
+    neighbours = [service["image"] for service in SERVICES.values() if "build" not in service]
+    for image in bases + neighbours:
+        assert re.fullmatch(r"[a-z./]+:[\w.-]+@sha256:[0-9a-f]{64}", image), image
+
+
 def test_what_the_build_imports_is_there():
     imports = re.findall(r"from (deepsimbad[\w.]*) import (\w+)", (PROJECT / "Dockerfile").read_text())
     assert imports
