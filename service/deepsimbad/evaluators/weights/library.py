@@ -42,7 +42,7 @@ class KnownWeights:
         return None if f"{kind}:" == HUB or not argument else argument
 
 
-def _patch_netvlad(drive: str, origin: str, dim: int, size_mb: int | None = None) -> KnownWeights:
+def _patch_netvlad(drive: str, origin: str, dim: int, size_mb: int) -> KnownWeights:
     file = f"{drive}_WPCA{dim}.pth.tar"
     return KnownWeights(
         f"patch-netvlad-{drive}-{dim}", f"netvlad:{file}", dim, (640, 480), "MIT",
@@ -75,8 +75,11 @@ KNOWN: tuple[KnownWeights, ...] = (
         "pytorch-netvlad", "netvlad:checkpoint.pth.tar", 32768, (640, 480), None,
         page="https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
     ),
-    *(_patch_netvlad("mapillary", "mapillary", dim, size) for dim, size in ((128, 67), (512, 92), (4096, 327))),
-    *(_patch_netvlad("pittsburgh", "pitts", dim) for dim in (128, 512, 4096)),
+    *(
+        _patch_netvlad(drive, origin, dim, size_mb)  # both hold the same layers
+        for drive, origin in (("mapillary", "mapillary"), ("pittsburgh", "pitts"))
+        for dim, size_mb in ((128, 67), (512, 92), (4096, 327))
+    ),
     KnownWeights(
         "openibl", "netvlad:vgg16_netvlad.pth", 4096, (640, 480), "MIT",
         url="https://github.com/yxgeee/OpenIBL/releases/download/v0.1.0-beta/vgg16_netvlad.pth",
@@ -85,6 +88,7 @@ KNOWN: tuple[KnownWeights, ...] = (
     KnownWeights(
         "megaloc", f"{HUB}gmberton/MegaLoc:get_trained_model", 8448, (322, 322), "MIT",
         page="https://github.com/gmberton/MegaLoc", commit="5fe0dd697c4a70ba3e23607f6716ab3c606b16db",
+        size_mb=914,  # of 228.6 million parameters
         packages=("torchvision", "huggingface_hub", "safetensors"),
     ),
     KnownWeights(
@@ -105,6 +109,7 @@ KNOWN: tuple[KnownWeights, ...] = (
     KnownWeights(
         "cosplace", f"{HUB}gmberton/CosPlace:get_trained_model", 2048, (640, 480), "MIT",
         page="https://github.com/gmberton/CosPlace", commit="52b56e95ea62245281281f3bafd7b9390d19a0fd",
+        size_mb=106,  # EigenPlaces' layers
         arguments=MappingProxyType({"backbone": "ResNet50", "fc_output_dim": 2048}), packages=("torchvision",),
     ),
     KnownWeights(
