@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from deepsimbad.store import catalog_jobs
+
 from .conftest import N_READY, RANKS, image_body, of_one_process, picture, ready_encodings, service
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
@@ -66,6 +68,20 @@ def test_a_map_and_the_last_remap(own_client):
     assert values['deepsimbad_last_remap_timestamp_seconds{domain="ready"}'] > ended_at
     assert values['deepsimbad_job_seconds_count{kind="remap",state="failed"}'] == 1
     assert values['deepsimbad_active_map_version{domain="ready"}'] == 1
+
+
+def test_a_scrape_counts_the_jobs_of_years_and_reads_the_last_ones_alone(own_client, monkeypatch):
+    catalog = own_client.services.catalog
+    (last_job,) = catalog.jobs("ready")
+    for _ in range(20):
+        catalog.cancel_queued_job(catalog.create_job("ready", "remap", {}).job_id)
+    read = catalog_jobs._job
+    jobs = []
+    monkeypatch.setattr(catalog_jobs, "_job", lambda row: jobs.append(read(row)) or jobs[-1])
+    values = scrape(own_client)
+    assert jobs == [last_job], "those cancelled while they waited did nothing"
+    assert values['deepsimbad_jobs{state="cancelled"}'] == 20
+    assert values['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
 
 
 def test_sessions_disk_release_and_process(own_client, tmp_path):

@@ -156,6 +156,21 @@ def test_a_long_journal_is_forgotten_in_pieces(
     assert store.n_observations(other) == 10
 
 
+def test_many_sessions_are_forgotten_in_pieces_however_little_each_saw(
+    store: SessionStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deepsimbad.store.sessions.PURGED_AT_ONCE", 4)
+    for n in range(10):
+        store.end(begin(store, f"s{n}"), "deleted", 5.0 + n).result()
+    assert store.purge(14.5).result() is True
+    assert store.find("s4").ending == "deleted", "one transaction for all of a day would keep robots waiting"
+    while store.purge(13.5).result():
+        pass
+    assert store.find("s9").ending == "deleted"
+    with pytest.raises(UnknownSessionError):
+        store.find("s8")
+
+
 def test_a_damaged_row_is_named(store: SessionStore, number: int, tmp_path: Path) -> None:
     store.append(number, observed(1), 1.0, StateSnapshot(1, {"mass": np.ones(3)})).result()
     with closing(sqlite3.connect(tmp_path / "sessions.sqlite", isolation_level=None)) as other:

@@ -7,7 +7,6 @@ import platform
 import shutil
 import threading
 import time
-from collections import Counter as CountOf
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -167,13 +166,15 @@ class StateCollector(Collector):
     _worker: InferenceWorker
     _sessions: Sessions
     _n_domains: int | None = None
-    _jobs: Sequence[JobRecord] = ()
+    _n_jobs: Mapping[JobState, int] = field(default_factory=dict)
+    _last_remaps: Sequence[JobRecord] = ()
     _serving: Mapping[str, MapRecord] = field(default_factory=dict)
 
     def look(self) -> set[str] | None:
         """Read the catalog for the next `collect`; the names of its domains, None where it cannot be read."""
         try:
-            domains, self._jobs = self._catalog.domain_names(), self._catalog.jobs()
+            domains = self._catalog.domain_names()
+            self._n_jobs, self._last_remaps = self._catalog.n_jobs(), self._catalog.last_jobs(REMAP)
             # Nobody could read the series of a hundred thousand domains: those whose maps are in memory have them.
             damaged_versions = self._maps.damaged()  # asked first: one that is back is in memory then
             series_domains = {
@@ -219,21 +220,14 @@ class StateCollector(Collector):
         yield _gauge("map_index_bytes", "Bytes of its index in the map file.", n_bytes, "domain")
 
     def _of_jobs(self) -> Iterator[GaugeMetricFamily]:
-        n_jobs = CountOf(job.state for job in self._jobs)
-        by_state = {(state.value,): n_jobs[state] for state in JobState}
+        by_state = {(state.value,): self._n_jobs.get(state, 0) for state in JobState}
         yield _gauge("jobs", "Jobs the catalog knows, by state.", by_state, "state")
-        # Jobs run one after the other as they came, whatever the clock was set to. One cancelled while it waited is out
-        # of that order and did nothing: it counts only where no remap of the domain ever ran.
-        ended_remaps = [job for job in self._jobs if job.kind == REMAP and job.finished_at is not None]
-        last_remaps = sorted(
-            {job.domain: job for job in sorted(ended_remaps, key=lambda job: job.n_starts > 0)}.items()
-        )
         outcomes = {
-            (domain, outcome): outcome == _outcome(job) for domain, job in last_remaps for outcome in REMAP_OUTCOMES
+            (job.domain, outcome): outcome == _outcome(job) for job in self._last_remaps for outcome in REMAP_OUTCOMES
         }
         meaning = "1 for the outcome of the remap that ended last, else 0."
         yield _gauge("last_remap", meaning, outcomes, "domain", "outcome")
-        ended_at = {(domain,): _seconds(job.finished_at or "") for domain, job in last_remaps}
+        ended_at = {(job.domain,): _seconds(job.finished_at or "") for job in self._last_remaps}
         yield _gauge("last_remap_timestamp_seconds", "When it ended, seconds since 1970.", ended_at, "domain")
 
 

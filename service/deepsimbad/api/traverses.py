@@ -26,7 +26,7 @@ from deepsimbad.api.requests import (
 from deepsimbad.errors import ConflictError, TraverseInUseError, UnknownTraverseError
 from deepsimbad.evaluators.grey_levels import DEEPEST, GreyLevels
 from deepsimbad.jobs.versions import TRAVERSE_ROLES
-from deepsimbad.store.records import ListPage
+from deepsimbad.store.records import JobState, ListPage
 from deepsimbad.store.traverses import Traverse
 
 router = APIRouter(prefix="/v1/admin/domains/{domain}/traverses", tags=["admin: traverses"], route_class=StrictRoute)
@@ -184,9 +184,8 @@ def get_traverse(domain: DomainName, name: TraverseName, services: RunningServic
 @router.delete("/{name}", status_code=204, responses=problems(404, 409, 422))
 def delete_traverse(domain: DomainName, name: TraverseName, services: RunningServices) -> None:
     """Remove a traverse and its frames; the maps made from it stay. A job that needs it is a 409."""
-    for job in services.catalog.jobs(domain):
-        traverse_names = {job.config.get(role) for role in TRAVERSE_ROLES}
-        if name in traverse_names and not job.state.is_final:
+    for job in services.catalog.jobs(domain, (JobState.QUEUED, JobState.RUNNING)):
+        if name in {job.config.get(role) for role in TRAVERSE_ROLES}:
             raise TraverseInUseError(
                 f"job {job.job_id} needs traverse {name}: cancel it or wait for its end", job_id=job.job_id
             )

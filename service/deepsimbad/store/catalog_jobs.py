@@ -4,6 +4,7 @@ import math
 import re
 import secrets
 import time
+from collections.abc import Collection
 from typing import Any
 
 from sqlite_utils import Database
@@ -117,9 +118,37 @@ class JobCatalog(OpenFile):
             )
             return [(row[-1], _job(row)) for row in rows]
 
-    def jobs(self, domain: str | None = None) -> list[JobRecord]:
-        """Every job, or every job of a domain, oldest first; raises UnknownDomainError."""
-        return list(reversed(self.newest_jobs(domain, None, _MAX_ROWID - 1).records))
+    def jobs(self, domain: str | None = None, states: Collection[JobState] = tuple(JobState)) -> list[JobRecord]:
+        """The jobs in some states, of a domain or all, oldest first; raises UnknownDomainError."""
+        with self._reading() as db:
+            if domain is not None:
+                get_domain(db, domain)
+            condition = "domain = coalesce(?, domain) AND state IN (SELECT value FROM json_each(?)) ORDER BY rowid"
+            return list(map(_job, db.execute(f"{_SELECT} WHERE {condition}", [domain, to_json(list(states))])))
+
+    def n_jobs(self) -> dict[JobState, int]:
+        """How many jobs there are of every state that any has; those of years are counted, not read."""
+        with self._reading() as db:
+            rows = db.execute("SELECT state, count(*) FROM job GROUP BY state")
+            return {JobState(state): n_jobs for state, n_jobs in rows}
+
+    def last_jobs(self, kind: str) -> list[JobRecord]:
+        """The job of a kind that ended last in every domain that has one, by domain.
+
+        Jobs run one after the other as they came, whatever the clock was set to. One cancelled while it waited is out
+        of that order and did nothing: it counts only where no other of the domain ever ran.
+        """
+        with self._reading() as db:
+            rows = db.execute(
+                f"""
+                {_SELECT} WHERE rowid IN (
+                    SELECT first_value(rowid) OVER (PARTITION BY domain ORDER BY n_starts > 0 DESC, rowid DESC)
+                    FROM job WHERE kind = ? AND finished_at IS NOT NULL
+                ) ORDER BY domain
+                """,  # noqa: S608 - of our own words
+                [kind],
+            )
+            return list(map(_job, rows))
 
 
 def _next_number(db: Database, job_id: str) -> int:

@@ -228,7 +228,7 @@ class MapCatalog(OpenFile):
 
     def _unlink(self, domain: str, version: int) -> bool:
         path = self.map_path(domain, version)
-        was_there = path.parent.is_dir() and remove_database(path)
+        was_there = path.exists() and remove_database(path)
         if was_there:
             sync(path.parent)
         return was_there
@@ -287,8 +287,10 @@ class MapCatalog(OpenFile):
 
     def map_of_job(self, domain: str, job_id: str) -> MapRecord | None:
         """The version that a job has sealed, whatever became of it since; raises UnknownDomainError."""
-        records = [record for record in self.maps(domain) if record.metrics.get("job_id") == job_id]
-        return records[-1] if records else None
+        with self._reading() as db:
+            get_domain(db, domain)
+            condition = "domain = ? AND metrics ->> 'job_id' = ? ORDER BY version DESC LIMIT 1"
+            return next(map(_map, db.execute(f"{_SELECT_MAP} WHERE {condition}", [domain, job_id])), None)
 
     def map_path(self, domain: str, version: int) -> Path:
         """Where the sealed file of a version lies, or will; raises InvalidInputError."""

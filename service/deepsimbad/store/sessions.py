@@ -239,17 +239,26 @@ class SessionStore(OpenFile):
         """
 
         def write(db: Database) -> bool:
+            bounds = {"before": ended_before, "most": PURGED_AT_ONCE}
             n_rows = db.execute(
                 """
                 DELETE FROM journal WHERE rowid IN (
-                    SELECT journal.rowid FROM session JOIN journal ON journal.session = session.number
-                    WHERE ended_at < ? LIMIT ?
+                    SELECT journal.rowid
+                    FROM (SELECT number FROM session WHERE ended_at < :before ORDER BY ended_at LIMIT :most)
+                    JOIN journal ON session = number LIMIT :most
                 )
                 """,
-                [ended_before, PURGED_AT_ONCE],
+                bounds,
             ).rowcount
-            if n_rows < PURGED_AT_ONCE:
-                db.execute("DELETE FROM session WHERE ended_at < ?", [ended_before])
+            if n_rows < PURGED_AT_ONCE:  # nothing is left of the journals of these
+                n_rows = db.execute(
+                    """
+                    DELETE FROM session WHERE number IN (
+                        SELECT number FROM session WHERE ended_at < :before ORDER BY ended_at LIMIT :most
+                    )
+                    """,
+                    bounds,
+                ).rowcount
             return bool(n_rows >= PURGED_AT_ONCE)
 
         return self._commits.submit(write)
