@@ -2,11 +2,15 @@
 
 import re
 import shutil
+import time
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
 from deepsimbad.store import catalog_jobs
+from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.records import KeyScope, current_moment
 
 from .conftest import N_READY, RANKS, image_body, of_one_process, picture, ready_encodings, service
 
@@ -82,6 +86,19 @@ def test_a_scrape_counts_the_jobs_of_years_and_reads_the_last_ones_alone(own_cli
     assert jobs == [last_job], "those cancelled while they waited did nothing"
     assert values['deepsimbad_jobs{state="cancelled"}'] == 20
     assert values['deepsimbad_last_remap{domain="ready",outcome="succeeded"}'] == 1
+
+
+def test_the_key_that_expires_next_is_told_before_its_robot_is_shut_out(tmp_path):
+    with Catalog.open(tmp_path) as catalog:
+        catalog.create_key(KeyScope.ADMIN)
+        revoked_key, _ = catalog.create_key(KeyScope.LOCALIZE, lifetime=timedelta(days=1))
+        catalog.revoke_key(revoked_key.key_id)
+        for days in (30, 10, 1e-9):
+            key, _ = catalog.create_key(KeyScope.LOCALIZE, lifetime=timedelta(days=days))
+        assert not key.is_usable(current_moment())
+    with service(tmp_path) as client:
+        in_days = (scrape(client)["deepsimbad_key_expiry_timestamp_seconds"] - time.time()) / 86400
+        assert in_days == pytest.approx(10, abs=0.1)
 
 
 def test_sessions_disk_release_and_process(own_client, tmp_path):

@@ -297,7 +297,7 @@ def _start(
         "the thread that runs jobs": lambda: runner.is_alive,
     }
     readiness = ReadinessCheck(catalog, store, threads)
-    metrics.watch(StateCollector(catalog, maps_, readiness.faults, worker, live_sessions))
+    metrics.watch(StateCollector(catalog, maps_, readiness.faults, worker, live_sessions, keys))
     exposure = {"host": settings.host, "port": settings.port, "n_keys": sum(map(keys.still_opens, keys.by_id))}
     if not keys.by_id:
         log.warning("runs open: no key was ever created, so whoever reaches this address may do all", extra=exposure)

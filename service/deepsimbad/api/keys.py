@@ -70,6 +70,13 @@ class KeyRing:
             self.by_id = {record.key_id: record for record in records}
         self._read_at = self._clock()
 
+    @property
+    def next_expiry(self) -> str | None:
+        """When the next of the usable keys expires; None: no one does."""
+        moment = current_moment()
+        expiries = [record.expires_at for record in self.by_id.values() if record.is_usable(moment)]
+        return min(filter(None, expiries), default=None)
+
     def scope_for(self, path: str) -> KeyScope | None:
         """The scope that a decoded path needs now; None: no key is asked.
 

@@ -27,6 +27,7 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from deepsimbad import release
+from deepsimbad.api.keys import KeyRing
 from deepsimbad.engine.maps import Maps
 from deepsimbad.engine.sessions import Sessions
 from deepsimbad.engine.worker import InferenceWorker
@@ -165,6 +166,7 @@ class StateCollector(Collector):
     _faults: Callable[[], Sequence[str]]
     _worker: InferenceWorker
     _sessions: Sessions
+    _keys: KeyRing
     _n_domains: int | None = None
     _n_jobs: Mapping[JobState, int] = field(default_factory=dict)
     _last_remaps: Sequence[JobRecord] = ()
@@ -195,6 +197,10 @@ class StateCollector(Collector):
         yield _gauge("inference_queue", "Work waiting for the inference worker.", {(): self._worker.n_waiting})
         yield _gauge("loaded_maps", "Active maps held in memory.", {(): self._maps.n_loaded})
         yield _gauge("sessions", "Sessions that have not ended.", {(): self._sessions.n_living})
+        next_expiry = self._keys.next_expiry
+        expires_at = {(): _seconds(next_expiry)} if next_expiry else {}
+        meaning = "When the next key expires, seconds since 1970; absent where none does."
+        yield _gauge("key_expiry_timestamp_seconds", meaning, expires_at)
         with suppress(OSError):
             usage = shutil.disk_usage(self._catalog.data_dir)
             yield _gauge("data_dir_free_bytes", "Free where the data directory lies.", {(): usage.free})
