@@ -400,9 +400,9 @@ class ClientCalls(Face, Generic[AnySession]):
 class Client(ClientCalls[Session], Blocking):
     """Talks to one Deep SIMBAD service and blocks; safe to share between threads.
 
-    Connection errors and the answers 408, 429, 502, 503 and 504 are retried with exponential backoff and jitter, or
-    after the service's own `Retry-After`, where repeating is safe: every call here but `admin.activate` with
-    `expected`, which is sent again only when the service surely did not act on it.
+    Connection errors and the answers 408, 429, 502, 503 and 504 are retried with exponential backoff and jitter, not
+    before the service's own `Retry-After`, for some 30 s in all, where repeating is safe: every call here but
+    `admin.activate` with `expected`, which is sent again only when the service surely did not act on it.
 
     Args:
         url: The service's address; absent: `$DEEPSIMBAD_URL`, else http://127.0.0.1:8000.

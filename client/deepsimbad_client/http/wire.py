@@ -99,9 +99,12 @@ def _by_proxy(url: str) -> str:
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How patient a client is: waits double from `base_s` on, the upper half of each drawn at random."""
+    """How patient a client is: waits double from `base_s` on, the upper half of each drawn at random.
 
-    attempts: int = 5  # times a request is sent in all; 1 never repeats
+    As it stands the waits come to 30 s, which a service takes to be replaced.
+    """
+
+    attempts: int = 10  # times a request is sent in all; 1 never repeats
     base_s: float = 0.25
     max_backoff_s: float = 8.0
     max_retry_after_s: float = 60.0  # a service that asks for more is not asked again: its error is raised at once
@@ -143,12 +146,12 @@ class Attempts:
         status, code = response.status_code, problem_of(response).get("code")
         if status not in self.repeat.value or self.n_sent >= self.policy.attempts or code in LASTING_CODES:
             return None
-        wait_s = retry_after_s(response.headers.get("retry-after"))
-        if wait_s is None:
+        asked_s = retry_after_s(response.headers.get("retry-after"))
+        if asked_s is None:
             self.answer_lost |= status not in REFUSED_STATUSES
-            wait_s = self.policy.backoff_s(self.n_sent, self.jitter())
-        elif wait_s > self.policy.max_retry_after_s:
+        elif asked_s > self.policy.max_retry_after_s:
             return None
+        wait_s = max(asked_s or 0.0, self.policy.backoff_s(self.n_sent, self.jitter()))
         return self._announce(wait_s, f"{status} {code or ''}".rstrip())
 
     def _announce(self, wait_s: float, reason: str) -> float:

@@ -10,7 +10,7 @@ import pytest
 from deepsimbad_client import errors
 from deepsimbad_client.http import retry_after_s
 
-from .scripted import JOB, POLICY, Script, answer
+from .scripted import JOB, POLICY, STATE, Script, answer
 
 OK = {"status": "alive"}
 FAILURES = (httpx2.ReadTimeout, httpx2.ReadError, httpx2.WriteError, httpx2.RemoteProtocolError, httpx2.DecodingError)
@@ -93,7 +93,18 @@ def test_the_last_failure_is_raised_after_the_last_try():
     with pytest.raises(errors.RateLimitedError, match="too fast") as refused:
         script.client().health()
     assert (refused.value.code, refused.value.retry_after_s) == ("slow_down", 2.0)
-    assert script.slept == [2.0, 2.0, 2.0]
+    assert script.slept == [2.0, 2.0, 3.0]  # as long as it asked, or longer
+
+
+@pytest.mark.parametrize("failure", [httpx2.ConnectError, answer(502), answer(503, retry_after="1")])
+def test_an_observation_outlasts_a_service_that_is_replaced(failure):
+    for jitter, waits_s in ((0.0, 20), (0.5, 30), (1.0, 40)):
+        script = Script(answer(200, STATE), failure)
+        session = script.client(retry=None, jitter=lambda fixed=jitter: fixed).attach_session("s")
+        with pytest.raises((errors.TransportError, errors.ServerError)):
+            session.observe(encoding=[1.0])
+        assert sum(script.slept) == pytest.approx(waits_s, abs=2)
+        assert len({request.headers["idempotency-key"] for request in script.requests[1:]}) == 1
 
 
 @pytest.mark.parametrize(
