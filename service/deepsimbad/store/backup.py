@@ -168,7 +168,7 @@ def _add_copy(tar: tarfile.TarFile, data_dir: Path, path: Path, folder: Path) ->
 
     def write(db: Database) -> None:
         copy.unlink(missing_ok=True)
-        db.execute("VACUUM INTO ?", [str(copy)])
+        db.execute("VACUUM INTO CAST(? AS TEXT)", [os.fsencode(copy)])  # UTF-8 or not
 
     with storage_faults(path):
         look_at(path, write)

@@ -3,6 +3,7 @@
 What the arrays mean is not known here: `core.map` names them, a table holds each.
 """
 
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -217,7 +218,7 @@ def seal(building_path: Path, final_path: Path) -> tuple[str, int]:
     with _taking_its_name(final_path) as sealing_path:
         with open_database(building_path) as db:
             check_integrity(db, building_path)
-            db.conn.execute("VACUUM INTO ?", [str(sealing_path)])
+            db.conn.execute("VACUUM INTO CAST(? AS TEXT)", [os.fsencode(sealing_path)])  # UTF-8 or not
         read_map(sealing_path)
         digest, n_bytes = sha256_of(sealing_path), sealing_path.stat().st_size
     with storage_faults(building_path):
