@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import shutil
 import signal
@@ -144,6 +145,12 @@ def test_the_data_directory_comes_from_the_flag_the_environment_or_here(deepsimb
         shutil.rmtree(tmp_path / folder)  # here: as every other test has it
 
 
+def test_a_data_directory_may_have_any_name(deepsimbad, drives):
+    folder = ("--data-dir", os.fsdecode(b"caf\xe9"))  # no UTF-8
+    for arguments in (("map", "route", *sources(drives), *READY), ("backup", "b.tar")):
+        assert deepsimbad(*arguments, *folder).code == 0
+
+
 def test_images_are_found_where_they_were_taken(deepsimbad, mapped_pictures, pictures, tmp_path):
     views = [pictures / "7.png", pictures / "21.png"]
     ran = deepsimbad("localize", "route", *views, "--json")
@@ -182,6 +189,12 @@ def test_named_errors_are_one_line_and_make_nothing(deepsimbad, drives, pictures
     mistyped = deepsimbad("map", "route", "--training", pictures, "--evaluator", "feature_l2:netvlad:mistyped.mat")
     assert re.search(r"missing_weights.*mistyped\.mat", mistyped.line)
     assert "no domains" in deepsimbad("info", "route").line
+    for evaluator in (READY[1], "objects"):  # a domain that holds nothing is left by neither, to forbid the other
+        line = deepsimbad(
+            "map", "route", "--training", sources(drives, part="#::-1")[-1], "--evaluator", evaluator
+        ).line
+        assert "domain_differs" not in line
+    assert "unknown_domain" in deepsimbad("info", "route").line
     backwards = deepsimbad("map", "route", *sources(drives, part="#::-1"), *READY, "--n-landmarks", 20)
     assert "backwards" in backwards.line
     assert not list(folder.rglob("0*"))
@@ -196,7 +209,7 @@ def test_named_errors_are_one_line_and_make_nothing(deepsimbad, drives, pictures
         (("info", "nowhere"), "nowhere"),
         (("localize", "nowhere", pictures / "1.png"), "nowhere"),
         (("localize", "route", pictures / "1.png"), "route"),  # it has no map
-        ((*images, "--evaluator", "feature_l2"), "another configuration"),
+        ((*images, "--evaluator", "feature_l2"), "delete it first"),  # it has frames
     ):
         assert word in deepsimbad(*command).line
 

@@ -278,6 +278,17 @@ def test_who_reads_does_not_wait_for_who_writes(campus: Catalog) -> None:
     assert campus.domain("campus").closed
 
 
+def test_a_domain_that_holds_files_of_any_kind_is_not_empty(campus: Catalog) -> None:
+    encoded = campus.data_dir / "domains/campus/encoding/0.npy"  # frames that `deepsimbad ray map` goes on from
+    encoded.parent.mkdir()
+    encoded.touch()
+    campus.delete_domain("campus", only_empty=True)
+    assert encoded.exists()
+    encoded.unlink()
+    campus.delete_domain("campus", only_empty=True)
+    assert campus.domains() == []
+
+
 def test_others_write_while_the_files_of_a_deleted_domain_go(campus: Catalog, monkeypatch: pytest.MonkeyPatch) -> None:
     remove = shutil.rmtree
 

@@ -50,6 +50,7 @@ from deepsimbad.jobs.remap_config import (
     refuse_impossible,
     remap_stages,
 )
+from deepsimbad.jobs.versions import domain_to_fill
 from deepsimbad.store.layout import checked_name
 from deepsimbad.store.traverses import Traverse
 from deepsimbad_client.errors import BrokenFrameError
@@ -179,11 +180,14 @@ def map_(
     refuse_impossible(config, {role: len(recording.frames) for role, recording in recordings.items()}, None)
     if any(recording.encodings is None for recording in recordings.values()):
         measure.load()
-    with open_given_catalog() as catalog:
-        record, _ = catalog.create_domain(domain, evaluator.as_dict(), closed, actions_m)
+    with open_given_catalog() as catalog, domain_to_fill(catalog, domain, evaluator.as_dict(), closed, actions_m):
         if thumbnails is not None:
-            record = catalog.set_options(domain, {"thumbnails": thumbnails})
-        picture_store = Pictures(settings.data_dir, settings.max_pixels) if record.options.get("thumbnails") else None
+            catalog.set_options(domain, {"thumbnails": thumbnails})
+        picture_store = (
+            Pictures(settings.data_dir, settings.max_pixels)
+            if catalog.domain(domain).options.get("thumbnails")
+            else None
+        )
         stages = _stages(config, recordings, measure, keeps_pictures=picture_store is not None)
         cancel_note = f"; no map was made, and the same command {after_cancel}"
         with progress_bar(stages, f"map {domain}", cancel_note=cancel_note) as progress:

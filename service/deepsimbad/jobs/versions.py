@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -252,6 +252,21 @@ def serve_learnt(catalog: Catalog, domain: str, record: MapRecord, progress: Pro
     return {"map_version": record.version, "active": True, "metrics": record.metrics}
 
 
+@contextmanager
+def domain_to_fill(
+    catalog: Catalog, name: str, evaluator: dict[str, Any], closed: bool, actions_m: Sequence[float]
+) -> Iterator[bool]:
+    """A domain and whether it is new; a new one that an error leaves empty is deleted. Raises as `create_domain`."""
+    _, is_new = catalog.create_domain(name, evaluator, closed, actions_m)
+    try:
+        yield is_new
+    except BaseException:
+        if is_new:
+            with suppress(DeepSimbadError):  # the first error is the one to tell
+                catalog.delete_domain(name, only_empty=True)  # somebody may have begun to use it meanwhile
+        raise
+
+
 @dataclass(frozen=True)
 class ImportReport:
     """An imported map's domain and version, whether it serves (`active`), and whether the domain is new."""
@@ -285,19 +300,14 @@ def import_map(
     config |= dict.fromkeys(TRAVERSE_ROLES)
     config["imported"] = {"domain": map_.domain, "version": map_.version, "sha256": digest}
     name = map_.domain if domain is None else domain
-    _, is_new = catalog.create_domain(name, dict(map_.evaluator), map_.closed, map_.actions_m.tolist())
-    version = None
-    try:
+    with domain_to_fill(catalog, name, dict(map_.evaluator), map_.closed, map_.actions_m.tolist()) as is_new:
         version = catalog.begin_map(name, config)
-        n_bytes = adopt(file, catalog.map_path(name, version), digest)
-        catalog.seal_map(name, version, digest, n_bytes, {**map_.metrics, **measures})
-    except BaseException:
-        if version is not None:
+        try:
+            n_bytes = adopt(file, catalog.map_path(name, version), digest)
+            catalog.seal_map(name, version, digest, n_bytes, {**map_.metrics, **measures})
+        except BaseException:
             catalog.discard_map(name, version)
-        if is_new:
-            with suppress(DeepSimbadError):  # the first error is the one to tell
-                catalog.delete_domain(name, only_empty=True)  # somebody may have begun to use it meanwhile
-        raise
+            raise
     if activate:
         catalog.activate(name, version, ANY)
     return ImportReport(name, version, activate, is_new, n_bytes, digest)

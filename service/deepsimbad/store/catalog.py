@@ -216,7 +216,7 @@ class Catalog(MapCatalog, JobCatalog):
             return {name: from_json(evaluator) for name, evaluator in rows}
 
     def delete_domain(self, name: str, *, only_empty: bool = False) -> None:
-        """Delete a domain with its jobs, maps and traverses, or leave it where it has any and `only_empty`.
+        """Delete a domain with its jobs, maps and files, or leave it where it has maps or files and `only_empty`.
 
         Raises:
             UnknownDomainError: There is no such domain.
@@ -224,8 +224,8 @@ class Catalog(MapCatalog, JobCatalog):
         """
         with self._writing() as db:
             get_domain(db, name)
-            traverses = layout.traverses_folder(self.data_dir, name)
-            if only_empty and (db.table("map").count_where("domain = ?", [name]) or any(traverses.glob("*.sqlite"))):
+            files = (path for path in layout.domain_folder(self.data_dir, name).rglob("*") if path.is_file())
+            if only_empty and (db.table("map").count_where("domain = ?", [name]) or any(files)):
                 return
             n_jobs = db.table("job").count_where("domain = ? AND state IN ('queued', 'running')", [name])
             if n_jobs or self._is_built(name):
