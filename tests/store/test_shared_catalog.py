@@ -280,6 +280,17 @@ def test_a_new_node_begins_with_all_domains_in_one_object(
     node_b.discard_map("domain-0", 1)
 
 
+def test_a_change_that_is_published_is_made_whatever_becomes_of_the_one_object(
+    node: MakeNode, store: tuple[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shared_catalog, "_LEAST_BETWEEN_STATES", 1)
+    node_a, node_b = node("here"), node("there")
+    (store[1] / "state.json.gz").mkdir()  # where no object can be written
+    make_domain(node_a)
+    node_b.follow()
+    assert node_b.domains() == node_a.domains() != []
+
+
 @pytest.mark.parametrize("step", ["put_map", "append", "_apply"])
 def test_a_crash_between_two_steps_is_mended_by_the_next_look(
     node: MakeNode, add_map: AddMap, monkeypatch: pytest.MonkeyPatch, step: str

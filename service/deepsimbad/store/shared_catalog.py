@@ -19,6 +19,7 @@ from deepsimbad.errors import (
     DomainDiffersError,
     LostActivationError,
     NotFoundError,
+    UnavailableError,
 )
 from deepsimbad.store import layout
 from deepsimbad.store.backup import Inspection
@@ -362,7 +363,8 @@ class SharedCatalog(Catalog):
             if self.store.append(position + 1, entry):
                 break
         self._apply(position + 1, entry)
-        self._write_state(position + 1)
+        with suppress(UnavailableError):  # the change is published; the log holds all that the state would
+            self._write_state(position + 1)
         return answer
 
     def _try_change(self, name: str, change: Callable[[], T]) -> tuple[_State, _State, int, T]:
