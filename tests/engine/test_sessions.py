@@ -224,6 +224,24 @@ async def test_the_sessions_of_a_deleted_domain_end_though_robots_end_some_meanw
             await service.observe(session_id, 1)
 
 
+@pytest.mark.parametrize("is_made_anew", [False, True])
+async def test_a_session_that_begins_while_its_domain_is_deleted_ends(mapped_catalog, monkeypatch, is_made_anew):
+    with open_service(mapped_catalog) as service:
+        create = service.store.create
+
+        def delete_first(record):
+            mapped_catalog.delete_domain("d")
+            if is_made_anew:
+                add_domain(mapped_catalog, "d")
+                add_map(mapped_catalog, contents=map_contents(relevance=Relevance.RRF))
+            return create(record)
+
+        monkeypatch.setattr(service.store, "create", delete_first)
+        with pytest.raises(errors.RetiredMapError):
+            await service.begin()
+        assert service.sessions.n_living == len(service.store.living_sessions()) == 0
+
+
 async def test_a_repeated_observation_counts_once_and_has_its_own_answer(mapped_catalog):
     async def check(service):
         for seed in (6, 5, 0, 3):

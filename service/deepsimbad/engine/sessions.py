@@ -36,6 +36,7 @@ from deepsimbad.errors import (
     DeepSimbadError,
     EndedSessionError,
     IdempotencyKeyReusedError,
+    RetiredMapError,
     SessionMovedError,
     TooManySessionsError,
     UnknownSessionError,
@@ -123,6 +124,7 @@ class Sessions:
             TooManySessionsError: The limit on living sessions, of all or of this key, is reached.
             IdempotencyKeyReusedError: A session of that id began with another configuration.
             EndedSessionError: The session of that id has ended.
+            RetiredMapError: The domain was deleted meanwhile.
         """
         digits = domain_digits(mapped_domain.record.name)
         if session_id is not None:
@@ -259,6 +261,11 @@ class Sessions:
                 return await self._begun_before(session_id, config)
             # A repetition may have found it on the disk already.
             session = self._living.setdefault(session_id, LiveSession(record, record.expires_at, state))
+            try:  # who deletes the domain ends its sessions afterwards, so that one of the two sees the other
+                await asyncio.to_thread(self._maps.pinned, snapshot.domain, snapshot.version, digest)
+            except RetiredMapError:
+                await self._end(session, DELETED)
+                raise
             return await asyncio.wrap_future(self._summaries.submit(view_of, session, record.expires_at, state))
         finally:
             self._n_beginning[key_id] -= 1
