@@ -104,6 +104,13 @@ def test_without_the_setting_no_origin_is_let_in(client):
         assert not [name for name in answer.headers if name.startswith("access-control")]
 
 
+def test_every_call_is_documented_to_refuse_a_foreign_origin(client):
+    for path, operations in client.get("/openapi.json").json()["paths"].items():
+        for method, operation in operations.items():
+            problem(client.request(method, path, headers={"Origin": ORIGIN}), 403, "foreign_host")
+            assert "403" in operation["responses"], (method, path)
+
+
 def test_a_preflight_needs_no_key_and_the_call_itself_does(cors_client):
     client, key = cors_client
     answer = preflight(client, ORIGIN)

@@ -396,13 +396,13 @@ def _disk_faults(data_dir: Path) -> list[str]:
     return faults
 
 
-@router.get("/healthz", responses=problems())
+@router.get("/healthz", responses=problems(403))
 async def healthz() -> Health:
     """The process lives; a supervisor restarts it where this stays unanswered."""
     return Health(status="alive")
 
 
-@router.get("/readyz", responses=problems())
+@router.get("/readyz", responses=problems(403))
 async def readyz(services: RunningServices) -> Readiness:
     """What serves is there: threads that work, a catalog and sessions that can be read and written, room on the disk.
 
@@ -418,7 +418,7 @@ async def readyz(services: RunningServices) -> Readiness:
     return Readiness(status="ready", damaged_maps=list(damaged_versions))
 
 
-@router.get("/metrics", response_class=PlainTextResponse, responses=problems())
+@router.get("/metrics", response_class=PlainTextResponse, responses=problems(403))
 async def metrics(services: RunningServices) -> Response:
     """What Prometheus scrapes."""
     content = await run_sync(services.metrics.render, limiter=services.health)

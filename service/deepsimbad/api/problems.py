@@ -180,7 +180,7 @@ def _instance(scope: Scope) -> str:
 _REFERENCE = "#/components/schemas/{model}"
 _DESCRIPTIONS = {
     401: "No key, or one that is unknown, revoked or expired; a service without keys asks for none",
-    403: "A key without the scope that the call needs",
+    403: "A key without the scope that the call needs; where no key exists, a foreign `Host` or `Origin`",
     404: "An unknown name or id",
     406: "No answer of the kind that `Accept` asks for; `reason` says why",
     409: "The present state forbids it",
