@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import signal
 import time
 
 import pytest
@@ -31,6 +32,18 @@ def test_a_backup_there_and_back(deepsimbad, mapped_dir, tmp_path):
     assert document(deepsimbad("info", "route", "--json", "--data-dir", "there")) == description
     remark(deepsimbad("backup", "c.tar"), "1 domains, 1 maps, 2 traverses")
     remark(deepsimbad("restore", "c.tar", "--data-dir", "elsewhere"))
+
+
+def test_a_backup_that_is_terminated_leaves_nothing(deepsimbad, mapped_dir, tmp_path, monkeypatch):
+    (tmp_path / "backups").mkdir()
+    monkeypatch.setattr("deepsimbad.store.backup.verify", lambda *_: signal.raise_signal(signal.SIGTERM))
+    handler = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        with pytest.raises(SystemExit, match="143"):
+            deepsimbad("backup", "backups/b.tar")
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert list((tmp_path / "backups").iterdir()) == []
 
 
 def test_a_map_moves(deepsimbad, mapped_dir, tmp_path):

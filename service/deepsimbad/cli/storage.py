@@ -1,5 +1,7 @@
 """`deepsimbad backup`, `restore`, `export`, `import` and `check`: data directories and maps as files."""
 
+import signal
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -35,6 +37,7 @@ _file_argument = click.argument("file", type=click.Path(path_type=Path))
 def backup(file: Path, as_json: bool) -> None:
     """Copy everything (domains, maps, traverses, sessions, keys) into FILE, beside a running service or not."""
     source = existing_data_dir()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # a timer's, or the system stops: what is half written goes
     with progress_bar({"copy": 1.0}, "backup") as progress:
         progress.stage("copy")
         backup_report = back_up(source, file, release(), progress.update)

@@ -133,6 +133,7 @@ def back_up(data_dir: Path, file: Path, release: str, on_progress: Progress) -> 
                 new_path.chmod(0o600)  # it holds the hashes of keys and where robots were
                 if layout.sessions_path(data_dir).exists():
                     members.append(_add_copy(tar, data_dir, layout.sessions_path(data_dir), new_path.parent))
+                    (new_path.parent / _SESSIONS).unlink()
                 members.append(_add_copy(tar, data_dir, catalog, new_path.parent))
                 inventory = _inventory(new_path.parent / _CATALOG, data_dir)
                 try:
