@@ -7,7 +7,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from deepsimbad_client import errors
+from deepsimbad_client import RetryPolicy, errors
 from deepsimbad_client.http import retry_after_s
 
 from .scripted import JOB, POLICY, STATE, Script, answer
@@ -33,6 +33,18 @@ def test_an_idempotent_call_is_sent_again_with_its_body(kind):
     last = script.requests[2]
     assert last.url == "http://service/v1/admin/domains/d/traverses/t/frames/3?position_m=1.5"
     assert last.headers["content-type"] == "image/jpeg"
+
+
+def test_a_service_is_waited_for_that_has_answered_once():
+    script = Script(httpx2.ConnectError)
+    client = script.client(retry=RetryPolicy())
+    with pytest.raises(errors.TransportError, match="after 5 tries"):
+        client.health()
+    script.outcomes = [answer(200, OK), httpx2.ConnectError]
+    assert client.health().status == "alive"
+    with pytest.raises(errors.TransportError, match="after 10 tries"):
+        client.health()
+    assert sum(script.slept) == 3.75 + 39.75
 
 
 def test_every_wait_is_told_to_the_log_with_its_reason(caplog):
