@@ -249,7 +249,10 @@ class Wire:
         """The tries of a call, none of them made yet."""
         n_tries = self._retry.attempts if self._has_answered else min(self._retry.attempts, self._retry.first_attempts)
         return Attempts(
-            replace(self._retry, attempts=n_tries), call.repeat, f"{call} at {self.url}{_by_proxy(self.url)}", self._jitter
+            replace(self._retry, attempts=n_tries),
+            call.repeat,
+            f"{call} at {self.url}{_by_proxy(self.url)}",
+            self._jitter,
         )
 
     def request(self, call: Call) -> httpx2.Request:
