@@ -262,6 +262,21 @@ def test_a_drive_is_fused_only_where_its_views_agree(season, store, run, append,
     assert (verdict["accepted"], "said not to share" in verdict["why"]) == (False, True)
 
 
+def test_a_stretch_that_shares_too_few_places_is_fused_by_a_drive_that_shares_more(season, run, append, catalog):
+    season("summer", 1, range(100))
+    season("stretch", 2, range(90, 180))
+    for seed, name in ((3, "winter"), (4, "spring")):
+        season(name, seed, range(180))
+    run("summer", n_landmarks=60, training_episodes=0)
+    metrics = append("stretch")
+    assert (metrics["fused"]["accepted"], metrics["n_map_images"]) == (False, 190)
+    for name in ("winter", "spring"):
+        metrics = append(name)
+        assert (metrics["fused"]["accepted"], metrics["n_map_images"]) == (True, 190)
+    entries = catalog.map(DOMAIN, 3).config["appended"]
+    assert [(entry["traverse"], entry["fused"]) for entry in entries] == [("stretch", True), ("winter", True)]
+
+
 def test_a_fused_frame_does_not_find_itself_when_the_map_is_checked(season, run, append, contents):
     encodings = [season(name, seed) for seed, name in enumerate(("summer", "winter", "spring"), 1)]
     run("summer", n_landmarks=60, training_episodes=0)

@@ -33,7 +33,7 @@ from deepsimbad.core.composed import (
     within_place_whitening,
 )
 from deepsimbad.core.descriptor import LandmarkStatistics, nearest_landmarks, rank_landmarks
-from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, second_season
+from deepsimbad.core.drive import Drive, SameRoute, SecondSeason, judge, second_season
 from deepsimbad.core.experience.nnql import NnqlConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
@@ -114,6 +114,18 @@ class KnownDrives:
         is_fusable = self.agree[season] & (number is None or self.agree[number]) & (season != number)
         return np.asarray(places[is_fusable], np.int64)
 
+    def agreeing(self, places: NDArray[np.int64], agrees: Callable[[NDArray[np.int64]], bool]) -> Self:
+        """With what a new drive, which agrees, tells of seasons that did not, as those that had shared too few places.
+
+        Args:
+            places: [k, 2] pairs (map image, frame of the new drive).
+            agrees: Whether the new drive sees the same as the images of some of the pairs.
+        """
+        agree, season = self.agree.copy(), self.source[places[:, 0], 0]
+        for number in np.flatnonzero(~agree):
+            agree[number] = agrees(places[season == number])
+        return replace(self, agree=agree)
+
     def basis(self, map_: Map) -> tuple[NDArray[np.float32] | None, NDArray[np.float64] | None]:
         """Split a map's projection into what came before a season's changes counted less, and what lets them.
 
@@ -163,6 +175,7 @@ class FusedMap:
     """A map with one drive more, and what `without` makes it anew from."""
 
     map: Map
+    known_drives: KnownDrives  # of the map before
     base: Map  # before new images
     drive: Drive
     new_frames: NDArray[np.int64]  # frames that became images
@@ -200,19 +213,23 @@ def fuse(
     map_rows = np.stack([rows[season][frame] for season, frame in known_drives.source.tolist()])
     prototypes = np.asarray(map_.landmark_model["prototypes"], np.float32)
     unknown_m = np.full(map_.n_images, np.nan)
+    of_images, of_drive = (_dissimilarities(row, whitening, prototypes) for row in (map_rows, rows[-1]))
     map_drive = Drive(
         position_m=map_.position_m,
         x_m=unknown_m if map_.x_m is None else map_.x_m,
         y_m=unknown_m if map_.y_m is None else map_.y_m,
         encodings=map_rows,
-        dissimilarities=_dissimilarities(map_rows, whitening, prototypes),
+        dissimilarities=of_images,
     )
-    measured_drive = replace(drive, dissimilarities=_dissimilarities(rows[-1], whitening, prototypes))
+    measured_drive = replace(drive, dissimilarities=of_drive)
     is_same = same_route is not False
     season, _, verdict = second_season(map_drive, map_.closed, drive, is_same, lambda _: measured_drive)
     if season is None:
         return None, verdict
 
+    known_drives = known_drives.agreeing(
+        season.places, lambda places: judge(of_images, of_drive, places, map_.position_m).accepted
+    )
     pairs = [
         known_drives.fusable(same_places(earlier_drive.route(), map_.route), number)
         for number, earlier_drive in enumerate(known_drives.seasons)
@@ -258,7 +275,9 @@ def fuse(
     base = replace(map_, landmark_model=model, **arrays)
     new_frames = np.setdiff1d(np.arange(drive.n_frames), pairs[-1][:, 1])
     longer_map = _with_new(base, drive, new_frames, _lists(base, u[-1][new_frames]))
-    return FusedMap(longer_map, base, drive, new_frames, initial_landmarks, season_sums, u[-1], pairs[-1]), verdict
+    return FusedMap(
+        longer_map, known_drives, base, drive, new_frames, initial_landmarks, season_sums, u[-1], pairs[-1]
+    ), verdict
 
 
 def _units(rows: NDArray[np.float32], whitening: NDArray[np.float64] | None) -> NDArray[np.float32]:

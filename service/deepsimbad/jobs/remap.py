@@ -380,8 +380,13 @@ class _Remap:
             map_ = append_drive(
                 old_map, measure_drive(drive, old_map.landmark_model, self.evaluator, self.progress.update)
             )
+            appended = record.config.get("appended", ())
         else:
-            map_ = fused_map.map
+            map_, drives = fused_map.map, fused_map.known_drives
+            agree = dict(zip((season.name for season in drives.seasons), drives.agree.tolist(), strict=True))
+            appended = [
+                earlier | {"fused": agree[earlier["traverse"]]} for earlier in record.config.get("appended", ())
+            ]
         config_document = config.as_dict()
         entry = {"traverse": config.training_traverse, "n_frames": drive.n_frames, "to_version": record.version}
         entry["fused"] = fused_map is not None
@@ -390,7 +395,7 @@ class _Remap:
             **record.config,
             "n_landmarks": old_map.n_landmarks,
             **{name: config_document[name] for name in ("append", "check_traverse", "gate_margin", "activate")},
-            "appended": [*record.config.get("appended", ()), entry],
+            "appended": [*appended, entry],
         }
         weights_sha256 = drive.weights_sha256 or old_map.weights_sha256
         if weights_sha256 is not None:
