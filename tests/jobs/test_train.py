@@ -14,7 +14,9 @@ from deepsimbad.core.experience.nnql import KnownWalk, NnqlConfig
 from deepsimbad.core.experience.training import TrainingWorld
 from deepsimbad.core.relevance import Query, Relevance
 from deepsimbad.errors import CancelledError
-from deepsimbad.jobs.build import HELD_OUT, SECOND_DRIVE, train_nnql
+from deepsimbad.evaluators.feature_l2 import FeatureL2
+from deepsimbad.evaluators.space import OwnDissimilarities
+from deepsimbad.jobs.build import HELD_OUT, SECOND_DRIVE, build, train_nnql
 from deepsimbad.jobs.progress import Progress
 from deepsimbad.jobs.remap_config import REMAP_STAGES
 from deepsimbad.jobs.versions import LEARN_STAGES, learn_online
@@ -68,6 +70,19 @@ def test_a_second_drive_of_the_route_gives_the_live_images(worlds):
     assert views.dissimilarities is second.dissimilarities
     assert (q_values.shape, q_values.dtype) == ((N, 3), np.float32)
     assert (q_values > 1).mean() > 0.5
+
+
+def test_an_evaluator_of_dissimilarities_of_its_own_is_rehearsed_with_the_landmarks_of_the_rehearsal():
+    class Cubes(OwnDissimilarities, FeatureL2):
+        def own_dissimilarities(self, encodings, model):  # its landmarks are the axes
+            return np.abs(encodings) ** 3
+
+    map_drive, second = drives()
+    map_build = build(
+        MapPlan(Relevance.COMPOSED, 4, (1.0,), same_route=True), map_drive, second, None, R, Cubes("none")
+    )
+    model = map_build.rehearsal.landmark_model
+    np.testing.assert_array_equal(model["prototypes"], map_build.initial_landmarks)
 
 
 def test_else_alternate_frames_are_held_out_of_the_map_they_look_at(worlds):

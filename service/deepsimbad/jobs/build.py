@@ -319,8 +319,9 @@ def _composed_in_space(
         on_progress,
         [replace(pair, first=in_space(pair.first), second=in_space(pair.second)) for pair in camera],
     )
-    full_model = {**model, **map_build.map.landmark_model}
-    full_map, rehearsal = (replace(map_, landmark_model=full_model) for map_ in (map_build.map, map_build.rehearsal))
+    full_map, rehearsal = (
+        replace(map_, landmark_model={**model, **map_.landmark_model}) for map_ in (map_build.map, map_build.rehearsal)
+    )
     return replace(map_build, map=full_map, rehearsal=rehearsal)
 
 
