@@ -106,6 +106,18 @@ def test_a_half_alone_is_answered_as_its_own_evaluator_would_and_both_are_better
     assert (live_statistics.encodings.mean[:D] != map_statistics.encodings.mean[:D]).all()
 
 
+def test_a_half_that_frames_of_the_map_lack_is_the_usual_one():
+    """As one that a live view lacks; with zeros in its place the ANR is 9.0, and 4.7 where none lacks any."""
+    training, test = season(2, 2.0, 2.0), season(3, 2.0, 2.0)
+    lacking = np.random.default_rng(0).random(N) < 0.5
+    training.encodings[lacking, D:] = 0
+    composed, (anr,) = score(Relevance.COMPOSED, FUSED, None, training, test)
+    np.testing.assert_allclose(
+        composed.map.usual_encoding[0, D:], training.encodings[~lacking, D:].mean(axis=0), atol=1e-6
+    )
+    assert anr < 7
+
+
 def test_a_frame_without_one_half_can_be_appended():
     """As one in which a detector finds nothing."""
     first_map = score(Relevance.COMPOSED, FUSED, None, season(1, 1.0, 1.0))[0].map

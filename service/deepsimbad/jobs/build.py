@@ -271,7 +271,7 @@ def build(
     if second is not None and np.array_equal(second.encodings, training.encodings):
         second = None  # one drive under two names is one season
     if plan.relevance.traits.compares_unit_vectors and evaluator.is_squared_l2:
-        return compose_map(plan, training, second, landmarks, n_landmarks, on_progress, camera, evaluator.halves)
+        return _composed_in_space(plan, training, second, landmarks, {}, n_landmarks, evaluator, on_progress, camera)
     candidates = training if landmarks is None else landmarks
     fit: Fitted | None = None
     origins: dict[str, Any] = {}
@@ -308,7 +308,7 @@ def _composed_in_space(
     on_progress: Callable[[float], None],
     camera: Sequence[SeenTwice],
 ) -> Built:
-    """`compose_map` where dissimilarities to all fitted landmarks stand for encodings (II-A, decision 0029)."""
+    """`compose_map` of what is compared: encodings, or dissimilarities to fitted landmarks (II-A, decision 0029)."""
     in_space = cache(partial(drive_in_space, model=model, evaluator=evaluator))  # two names of one drive stay one
     map_build = compose_map(
         plan,
@@ -318,6 +318,7 @@ def _composed_in_space(
         n_landmarks,
         on_progress,
         [replace(pair, first=in_space(pair.first), second=in_space(pair.second)) for pair in camera],
+        evaluator.halves,
     )
     full_map, rehearsal = (
         replace(map_, landmark_model={**model, **map_.landmark_model}) for map_ in (map_build.map, map_build.rehearsal)
@@ -327,11 +328,23 @@ def _composed_in_space(
 
 def drive_in_space(drive: Drive, model: LandmarkModel, evaluator: Evaluator) -> Drive:
     """The drive with what a composed map compares in place of encodings."""
+    if evaluator.halves:
+        return drive.standing_for(_with_usual_halves(drive.encodings, evaluator.halves))
     if evaluator.is_squared_l2:
         return drive
     starts = range(0, drive.n_frames, _FRAMES_A_BLOCK)
     blocks = [evaluator.comparison_vectors(drive.encodings[start : start + _FRAMES_A_BLOCK], model) for start in starts]
     return drive.standing_for(np.concatenate(blocks))
+
+
+def _with_usual_halves(encodings: NDArray[np.float32], halves: Sequence[int]) -> NDArray[np.float32]:
+    """A drive's encodings [n, d] with the mean of the others in place of a half that a frame lacks, which is zeros."""
+    completed = encodings.copy()
+    for half in np.split(completed, np.cumsum(halves)[:-1], axis=1):
+        is_lacking = ~half.any(axis=1)
+        if is_lacking.any() and not is_lacking.all():
+            half[is_lacking] = half[~is_lacking].mean(axis=0, dtype=np.float64)
+    return completed
 
 
 def train_nnql(
