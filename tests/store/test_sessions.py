@@ -3,7 +3,7 @@
 import asyncio
 import sqlite3
 from collections.abc import Iterator
-from concurrent.futures import wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -169,6 +169,13 @@ def test_many_sessions_are_forgotten_in_pieces_however_little_each_saw(
     assert store.find("s9").ending == "deleted"
     with pytest.raises(UnknownSessionError):
         store.find("s8")
+
+
+def test_no_robot_waits_while_views_are_counted(store: SessionStore, number: int) -> None:
+    """A session of days has a hundred thousand, and truths are told one by one."""
+    store.append(number, observed(1), 1.0).result()
+    with ThreadPoolExecutor() as pool, store._reader_lock:
+        assert pool.submit(store.n_observations, number).result(5.0) == 1
 
 
 def test_a_damaged_row_is_named(store: SessionStore, number: int, tmp_path: Path) -> None:

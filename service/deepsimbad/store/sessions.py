@@ -321,8 +321,8 @@ class SessionStore(OpenFile):
             return row
 
     def n_observations(self, number: int) -> int:
-        """How many observations a session's journal holds."""
-        with self._reading() as db:
+        """How many observations a session's journal holds; counted as for `newest_living`."""
+        with storage_faults(self._path), open_database(self._path, read_only=True) as db:
             return _n_observations(db, number)
 
     def save_true_positions(
