@@ -87,6 +87,7 @@ def test_compose_agrees_with_the_image():
         assert entry["security_opt"] == ["no-new-privileges:true"], name
         assert entry["cap_drop"] == ["ALL"], name
         assert entry["mem_limit"], name
+        assert entry["logging"]["options"]["max-size"], name
         assert entry["ports"] == ["80:80", "443:443"] or all(port.startswith("127.0.0.1:") for port in entry["ports"])
         assert set(entry.get("cap_add", ())) <= {"NET_BIND_SERVICE"}, name
         assert {volume.split(":")[0] for volume in entry["volumes"] if volume[0] != "."} <= set(COMPOSE["volumes"]), (
@@ -98,7 +99,7 @@ def test_compose_agrees_with_the_image():
 
 def test_the_proxy_asks_the_service():
     proxy, settings = SERVICES["proxy"], Settings()
-    assert re.search(r":\d+\.\d+\.\d+$", proxy["image"]), "pinned"
+    assert re.search(r":\d+\.\d+\.\d+@sha256:[0-9a-f]{64}$", proxy["image"]), "pinned"
     assert "./deploy/Caddyfile:/etc/caddy/Caddyfile:ro" in proxy["volumes"]
     config = (PROJECT / "deploy" / "Caddyfile").read_text()
     assert f"{{$DEEPSIMBAD_UPSTREAM:deepsimbad:{PORT}}}" in config
@@ -154,7 +155,7 @@ def test_prometheus_finds_the_service_and_its_rules_and_every_alarm_reaches_a_re
     ((target,),) = [group["targets"] for group in receiver["static_configs"]]
     name, port = target.split(":")
     assert [published.split(":")[2] for published in SERVICES[name]["ports"]] == [port]
-    assert re.search(r":v\d+\.\d+\.\d+$", SERVICES[name]["image"]), "pinned, as Prometheus is"
+    assert re.search(r":v\d+\.\d+\.\d+@sha256:[0-9a-f]{64}$", SERVICES[name]["image"]), "pinned, as Prometheus is"
     assert name in SERVICES["prometheus"]["depends_on"]
     assert option_of(name, "--storage.path") in [volume.split(":")[1] for volume in SERVICES[name]["volumes"]]
     config, _ = config_of(name)
