@@ -50,7 +50,10 @@ class OwnSpaceL2(Trunk):
     """Squared L2 of encodings treated as any other dissimilarity, to tell what decision 0029 costs by itself."""
 
     kind = "l2"
-    fitting = Fitting.NOTHING  # type: ignore[assignment]
+
+    def __init__(self, extractor: str) -> None:
+        super().__init__(extractor)
+        self.fitting = Fitting.NOTHING
 
     def fit(self, lesson: Lesson) -> Fitted:
         """The landmarks' encodings."""
