@@ -9,14 +9,18 @@ from functools import cache
 from pathlib import Path
 
 from deepsimbad.settings import Settings
+from tests.contract.conftest import wait_until
 
 with warnings.catch_warnings(action="ignore"):  # which are Ray's, of what it uses
     import ray
     from ray import serve
+    from ray.exceptions import RayError
+    from ray.serve.exceptions import RayServeException
     from ray.serve.schema import ServeDeploySchema  # noqa: F401 - for tests
 
     from deepsimbad.fleet import application
     from deepsimbad.fleet.application import from_yaml  # noqa: F401 - for tests
+    from deepsimbad.fleet.replica import replica_name
 
 # Processes are found by these names, also those of tests that run beside these in another cluster.
 _names = (f"fleet-{os.getpid()}-{number}" for number in itertools.count())
@@ -38,8 +42,9 @@ def cluster():
 class Fleet:
     """The address of a fleet, and its processes."""
 
-    def __init__(self, name, address):
+    def __init__(self, name, address, n_replicas):
         self.name = name
+        self.replicas = [serve.get_deployment_handle(replica_name(number), name) for number in range(n_replicas)]
         self.url = "http://{}:{}".format(*address)
 
     def pids(self, deployment):
@@ -53,9 +58,24 @@ class Fleet:
                     pids.append(int(process.name))
         return pids
 
+    def wait_for_replicas(self):
+        """Return when all that have domains are back from earlier kills."""
+        wait_until(lambda: all(serves(replica) for replica in self.replicas))
+
     def kill(self, deployment):
+        """Kill the process of a deployment: one dies at a time."""
+        self.wait_for_replicas()
         for pid in self.pids(deployment):
             os.kill(pid, signal.SIGKILL)
+
+
+def serves(replica):
+    """Whether a replica answers: True once there is one; False: it was killed this moment."""
+    try:
+        replica.lives.remote(0).result()
+    except (RayError, RayServeException):
+        return False
+    return True
 
 
 @contextmanager
@@ -70,7 +90,7 @@ def running(settings: Settings, n_replicas=2, make_run_job=None, n_administrator
             fleet = application.build(settings, n_replicas, make_run_job, 1, n_administrators=n_administrators)
             front = application.start(fleet, name)
             address = front.address.remote().result()
-        yield Fleet(name, address)
+        yield Fleet(name, address, n_replicas)
     finally:
         with warnings.catch_warnings(action="ignore"):
             serve.delete(name)
