@@ -244,7 +244,7 @@ def test_a_robot_that_drives_is_seen_and_gone_through_step_by_step(open_page, se
         assert page.get_by_role("button", name="One step back").is_disabled()
         page.get_by_role("button", name="Follow live").click()
         page.get_by_text("After 12 views").wait_for()
-        assert page.locator(".places img").count() > 0, "thumbnails of the places"
+        page.locator(".places img").first.wait_for()  # thumbnails of the places
         page.get_by_alt_text("The view").wait_for()
         with httpx2.Client(base_url=service) as caller:
             caller.delete(f"/v1/sessions/{live.session_id}")

@@ -21,7 +21,7 @@ def free_port():
 
 
 def wait_until_ready(port, running):
-    give_up = time.monotonic() + 60
+    give_up = time.monotonic() + 300
     while time.monotonic() < give_up:
         assert running.poll() is None, running.communicate()
         try:

@@ -6,7 +6,6 @@ import shutil
 import signal
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -100,12 +99,13 @@ def test_what_was_acknowledged_is_there_afterwards(server: ServerProcess) -> Non
 
 
 def send_frame(server: ServerProcess, n_sent: int) -> socket.socket:
-    """A request whose body has come in part."""
+    """A request that is under way, whose body has come in part."""
     body = json.dumps({"encoding": [1.0] * 8}).encode()
     connection = server.connect()
     head = "PUT /v1/admin/domains/loop/traverses/drive/frames/7?position_m=7 HTTP/1.1\r\nHost: localhost\r\n"
     head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
     connection.sendall(head.encode() + body[:n_sent])
+    wait_until(lambda: "deepsimbad_requests_in_flight 2.0" in server.client.get("/metrics").text)  # with this one
     return connection
 
 
@@ -150,7 +150,6 @@ def test_who_takes_too_long_is_told_so(server: ServerProcess) -> None:
     server.environment = {"DEEPSIMBAD_SHUTDOWN_GRACE_S": "1"}
     server.start()
     with send_frame(server, 5) as busy_connection:
-        time.sleep(0.1)
         end(server)
         head, _, content = read_all(busy_connection).partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 503 ")
@@ -182,7 +181,6 @@ def test_a_second_signal_does_not_wait(server: ServerProcess) -> None:
     robot = Robot(server, 1)
     for signal_number, code in ENDS.items():
         with send_frame(server, 5):
-            time.sleep(0.1)
             end(server, signal_number)
             wait_until(lambda: is_stopping(server))
             end(server, signal_number)

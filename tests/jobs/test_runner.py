@@ -62,6 +62,7 @@ def close_while_one_runs(runner, gate):
     """Ask the runner to end, and let the job through that it waits for."""
     closing = threading.Thread(target=runner.close)
     closing.start()
+    assert runner._closing.wait(WITHIN_S)
     gate.open.set()
     closing.join(WITHIN_S)
     assert not closing.is_alive()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from deepsimbad_client import Client
+from deepsimbad_client import Client, RetryPolicy
 from deepsimbad_client.commands import demo as demonstration
 from deepsimbad_client.http.admin import follow_job
 from deepsimbad_client.http.local_server import LocalServer
@@ -42,7 +42,8 @@ def test_a_job_and_a_session_outlive_their_service(tmp_path, encodings, is_kille
         if job.stage is not None:
             has_begun.set()
 
-    with LocalServer(tmp_path / "data") as server, Client(server.url) as client:
+    patience = RetryPolicy(attempts=60)  # a start may take long
+    with LocalServer(tmp_path / "data") as server, Client(server.url, retry=patience) as client:
         end = server.kill if is_killed else server.stop
         client.admin.put_domain("d", ENCODINGS)
         for name in ("landmarks", "summer"):
@@ -53,7 +54,7 @@ def test_a_job_and_a_session_outlive_their_service(tmp_path, encodings, is_kille
         follower.start()
         try:
             assert has_begun.wait(60), heard
-            last = heard[-1]
+            last = next(job for job in heard if job.stage is not None)
             end()
             server.start()
         finally:
