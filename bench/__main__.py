@@ -1,12 +1,11 @@
 """Run every benchmark and write docs/results/bench.md, or print some: python -m bench [index session ...]."""
 
-import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from bench.answering import retrieval_table, step_table
 from bench.building import composed_table, landmark_table, map_file_table, nnql_table
 from bench.index_size import index_table
-from bench.measurement import machine, write_page
+from bench.measurement import RESULTS, Command, machine, one_of, print_page
 from bench.remap import remap_table
 from bench.serving import http_table, restart_table, session_table
 
@@ -33,9 +32,12 @@ def lines(names: Iterable[str] = TABLES) -> Iterator[str]:
         yield from TABLES[name]()
 
 
+def measure(tables: Sequence[str]) -> None:
+    """Print these tables; none: write the page of all."""
+    print_page(lines(tables or TABLES), None if tables else RESULTS / "bench.md")
+
+
 if __name__ == "__main__":
-    if sys.argv[1:]:
-        for line in lines(sys.argv[1:]):
-            print(line, flush=True)
-    else:
-        write_page("bench.md", lines())
+    command = Command(__doc__)
+    command.add_argument("tables", nargs="*", type=one_of(TABLES), metavar="TABLE", help=", ".join(TABLES))
+    command.run(lambda arguments: measure(arguments.tables))

@@ -4,17 +4,15 @@ import json
 import resource
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import Any
 
 import numpy as np
 
-from bench.measurement import ACTIONS_M, duration, markdown, timed
+from bench.measurement import ACTIONS_M, Command, duration, markdown, timed, work_folder
 from bench.worlds import (
     ENCODING_DIM,
     N_CANDIDATES,
@@ -53,7 +51,7 @@ def landmark_table() -> Iterator[str]:
 
 
 def _in_own_process(task: str) -> dict[str, float]:
-    """The figures that `main` prints for a task, in a process of its own, whose peak of memory is the task's."""
+    """The figures that `measure` prints for a task, in a process of its own, whose peak of memory is the task's."""
     command = [sys.executable, "-m", "bench.building", task]
     process = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own interpreter
     return dict(json.loads(process.stdout))
@@ -68,8 +66,8 @@ def map_file_table() -> Iterator[str]:
         "every image's landmarks drawn at random": _with_model(standardised_map(scattered_lists(NCLT_IMAGES))),
         "landmarks that drift from image to image": _with_model(standardised_map(dense_lists(NCLT_IMAGES))),
     }
-    with tempfile.TemporaryDirectory() as folder:
-        building, sealed = Path(folder) / "1.building", Path(folder) / "1.sqlite"
+    with work_folder() as folder:
+        building, sealed = folder / "1.building", folder / "1.sqlite"
         yield from markdown(head, (_map_file_row(name, map_, building, sealed) for name, map_ in kinds.items()))
         sizes = sorted(table_bytes(sealed).items(), key=lambda item: -item[1])
     yield ""
@@ -136,16 +134,16 @@ def nnql_table() -> Iterator[str]:
     planning = timed(lambda: plan_by_experience(view), repeats=201, warm_up=20)
     yield f"Values of a view's 10 actions, the four nearest of {NCLT_IMAGES:,} map images included: {planning}."
     yield ""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "map"
+    with work_folder() as folder:
+        path = folder / "map"
         write_map(path, _with_model(standardised_map(lists, **learnt)))
         n_bytes = table_bytes(path)["q_value"] / NCLT_IMAGES
     yield f"The experience database takes {n_bytes:.1f} bytes a map image (`dbstat` pages)."
 
 
-def main() -> None:
+def measure(task: str) -> None:
     """Print what one selection or one training takes, as JSON."""
-    spent: dict[str, Any] = _selection() if sys.argv[1] == "landmarks" else _training(Relevance(sys.argv[1]))
+    spent = _selection() if task == "landmarks" else _training(Relevance(task))
     print(json.dumps({**spent, "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6}))
 
 
@@ -197,4 +195,6 @@ def _composed_map() -> tuple[Map, Query]:
 
 
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("task", choices=("landmarks", *Relevance))
+    command.run(lambda arguments: measure(arguments.task))

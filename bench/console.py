@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bench.link import JSON, Link
-from bench.measurement import Limit, breaches, limit_table, machine, write_page
+from bench.measurement import RESULTS, Command, Limit, breaches, limit_table, machine, print_page
 from bench.serving import mapped_service
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 
@@ -129,4 +129,4 @@ def _spent(inspector: Any) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    write_page("console.md", lines())
+    Command(__doc__).run(lambda _: print_page(lines(), RESULTS / "console.md"))

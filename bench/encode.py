@@ -8,18 +8,16 @@ the machine does; medians count.
 
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
 from bench.link import Link
-from bench.measurement import Timing, interleaved, machine, markdown, timed, write_page
+from bench.measurement import RESULTS, Command, Timing, interleaved, machine, markdown, print_page, timed, work_folder
 from bench.robots import LiveRobot, Waits, drive
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute, Runtime
@@ -135,7 +133,7 @@ def batches() -> Iterator[str]:
 def robots(bodies: list[bytes]) -> Iterator[str]:
     """Lines on sixteen robots against one service, beside what the same machine encodes without one."""
     loop_rate = _own_rate(bodies)
-    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
+    with work_folder() as folder, LocalServer(folder / "data") as server:
         with Link(server.url) as link:
             link.ask("PUT", f"/v1/admin/domains/{_DOMAIN}", {"evaluator": {"kind": "feature_l2"}})
             dim = link.ask("GET", f"/v1/domains/{_DOMAIN}")["encoding_dim"]
@@ -207,8 +205,8 @@ def starts() -> Iterator[str]:
         command = [sys.executable, "-c", f"import {name}"]
         imported_s[name] = timed(lambda: subprocess.run(command, check=True), 3, warm_up=0).median_s  # noqa: B023, S603
     for runtime in (Runtime.TORCH, Runtime.ONNXRUNTIME):
-        with tempfile.TemporaryDirectory() as folder:
-            server = LocalServer(Path(folder) / "data", environment={"DEEPSIMBAD_NETWORK_RUNTIME": runtime.value})
+        with work_folder() as folder:
+            server = LocalServer(folder / "data", environment={"DEEPSIMBAD_NETWORK_RUNTIME": runtime.value})
             with server, Client(server.url) as client:
                 client.admin.put_domain(_DOMAIN, {"kind": "feature_l2"})
             seconds = []
@@ -238,4 +236,4 @@ def report() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    write_page("encode.md", report())
+    Command(__doc__).run(lambda _: print_page(report(), RESULTS / "encode.md"))

@@ -8,9 +8,7 @@ images, one season: landmarks are the map's own).
 """
 
 import itertools
-import sys
-import tempfile
-import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import duration, machine, markdown, real_recordings, write_page
+from bench.measurement import RESULTS, Command, duration, machine, markdown, one_of, print_page, timed, work_folder
+from bench.recordings import MAX_PIXELS, NETVLAD, real_recordings
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.metrics import RetrievalScores, mean_interval
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE, Relevance
@@ -41,7 +40,7 @@ from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings import Recording
 from deepsimbad_client.recordings.sources import open_source
 
-N_LANDMARKS, MAX_PIXELS = 200, 50_000_000
+N_LANDMARKS = 200
 COMPARED = (Relevance.RRF, DEFAULT_RELEVANCE)
 L2_IN_OWN_SPACE = "feature_l2, in its own space"
 
@@ -180,12 +179,7 @@ class Trial:
         evaluator, drive = kind.make(self.drives.extractor), self.drives.of(self.landmarks or self.training, kind)
         rows = np.linspace(0, drive.n_frames - 1, min(N_LANDMARKS, drive.n_frames)).astype(np.int64)
         model = evaluator.fit(Lesson(drive.encodings, rows)).model
-        seconds = []
-        for row in range(12):
-            start_s = time.perf_counter()
-            evaluator.dissimilarities(drive.encodings[row : row + 1], model)
-            seconds.append(time.perf_counter() - start_s)
-        return float(np.median(seconds[2:]))
+        return timed(lambda: evaluator.dissimilarities(drive.encodings[:1], model), repeats=10).median_s
 
 
 class Drives:
@@ -234,7 +228,7 @@ def campus(work: Path) -> Iterator[Trial]:
 def netvlad64(work: Path) -> Iterator[Trial]:
     """All orders of the three domains; no images."""
     folder, drives = real_recordings() / "nordland_netvlad64", Drives(work, "none")
-    for order in itertools.permutations(("nr", "nq", "nq2")):
+    for order in itertools.permutations(NETVLAD):
         yield Trial(drives, *(str(folder / f"{name}.npy") for name in order))
 
 
@@ -317,18 +311,17 @@ def difference(relevance: str, results: Mapping[str, list[Scored]], kind: str, r
     return f"{ranks[kind].mean() - ranks[better].mean():+.2f} ({low:+.2f} .. {high:+.2f}) from `{better}`"
 
 
-def main() -> None:
-    """Write the page."""
-    names = sys.argv[2:] or list(SETS)
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder)
-        work.mkdir(parents=True, exist_ok=True)
-        if names == list(SETS):
-            write_page("evaluators.md", lines(work, names))
-        else:
-            for line in lines(work, names):
-                print(line, flush=True)
+def measure(arguments: Namespace) -> None:
+    """Print the sets asked for; the page where that is all of them."""
+    names = arguments.sets or list(SETS)
+    if names != ["campus"]:
+        real_recordings()  # rather than after an hour of rendering
+    with work_folder(arguments.work) as work:
+        print_page(lines(work, names), RESULTS / "evaluators.md" if names == list(SETS) else None)
 
 
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("work", type=Path, nargs="?", metavar="WORK")
+    command.add_argument("sets", nargs="*", type=one_of(SETS), metavar="SET")
+    command.run(measure)

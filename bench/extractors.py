@@ -10,7 +10,6 @@ import itertools
 import json
 import os
 import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.measurement import machine, markdown, real_recordings, write_page
+from bench.measurement import RESULTS, Command, machine, markdown, print_page, work_folder
 from bench.nordland import kept_frames, season_folder
+from bench.recordings import real_recordings
 from deepsimbad.cli import run
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client.recordings.sources import open_source
@@ -44,14 +44,12 @@ class Split:
 
 def railway(data: Path, work: Path) -> Iterator[Split]:
     """The railway in two seasons; frames that show nothing in either are left out. Landmarks come from elsewhere."""
-    summer, winter = data / "nordland" / "summer", data / "nordland" / "winter"
-    drives = {}
+    seasons, drives = (data / "nordland" / "summer", data / "nordland" / "winter"), {}
     for half, numbers in (("first", range(1000)), ("second", range(1000, 2000))):
-        frames = kept_frames((summer, winter), numbers)
-        for season in (summer, winter):
-            drives[season.name, half] = str(
-                season_folder(work / f"{season.name}-{half}", season, frames, numbers.start)
-            )
+        frames = kept_frames(seasons, numbers)
+        for season in seasons:
+            folder = season_folder(work / f"{season.name}-{half}", season, frames, numbers.start)
+            drives[season.name, half] = str(folder)
     for group, map_season, live_season, half, other in (
         ("railway, map summer 0..999, live winter", "summer", "winter", "first", "second"),
         ("railway, map summer 1000..1999, live winter", "summer", "winter", "second", "first"),
@@ -69,15 +67,10 @@ def railway(data: Path, work: Path) -> Iterator[Split]:
 
 def corridor(data: Path) -> Iterator[Split]:
     """The corridor walked twice: the map is one half of the first walk, the landmarks are the other half."""
-    ref, query, accepted = (
-        data / "corridor" / "ref",
-        data / "corridor" / "query",
-        data / "corridor" / "ground_truth_new.npy",
-    )
-    for map_half, landmark_half in (("0:56", "56:111"), ("56:111", "0:56")):
-        n_landmarks = 55 if landmark_half == "56:111" else 56
-        options = ("--ground-truth", str(accepted))
-        yield Split(CORRIDOR, f"{ref}#{landmark_half}", f"{ref}#{map_half}", str(query), n_landmarks, options)
+    ref, query, accepted = (str(data / "corridor" / name) for name in ("ref", "query", "ground_truth_new.npy"))
+    for map_half, landmark_half, n_landmarks in (("0:56", "56:111", 55), ("56:111", "0:56", 56)):
+        options = ("--ground-truth", accepted)
+        yield Split(CORRIDOR, f"{ref}#{landmark_half}", f"{ref}#{map_half}", query, n_landmarks, options)
 
 
 def campus(work: Path) -> Iterator[Split]:
@@ -139,11 +132,12 @@ def report(splits: list[Split], work: Path) -> Iterator[str]:
             cells.append(" / ".join(f"{value:.2f}" for value in anr) + f" ({recall:.0f})")
         rows.append([group, *cells])
         ratios.append([_mean(of_splits, extractor, "anr", "composed") / best for extractor in extractors])
-    means = [f"{mean:.2f}" for mean in np.exp(np.log(ratios).mean(axis=0))]
-    rows.append(["geometric mean of `composed` against the gradient grid", *means])
     is_elsewhere = [group != CORRIDOR for group in grouped]
-    means = [f"{mean:.2f}" for mean in np.exp(np.log(np.array(ratios)[is_elsewhere]).mean(axis=0))]
-    rows.append([f"the same without {CORRIDOR}", *means])
+    for title, counted_ratios in (
+        ("geometric mean of `composed` against the gradient grid", np.array(ratios)),
+        (f"the same without {CORRIDOR}", np.array(ratios)[is_elsewhere]),
+    ):
+        rows.append([title, *(f"{mean:.2f}" for mean in np.exp(np.log(counted_ratios).mean(axis=0)))])
     yield from markdown(("split", *extractors), rows)
     yield ""
     costs_more = zip(grouped, np.array(ratios)[:, 0] - 1, strict=True)
@@ -175,11 +169,10 @@ def _mean(of_splits: list[dict[str, Any]], extractor: str, figure: str, name: st
     return float(np.mean([document[extractor][figure][name] for document in of_splits]))
 
 
-def main() -> None:
-    """Measure, print, write docs/results/extractors.md."""
+def lines() -> Iterator[str]:
+    """Measure; the lines of the page."""
     data = real_recordings()
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
+    with work_folder() as work:
         weights = work / "weights"
         weights.mkdir()
         squeezenet = data.parent / "weights" / "squeezenet1_0" / "squeezenet1_0_caffe.npz"
@@ -187,8 +180,8 @@ def main() -> None:
             (weights / squeezenet.name).symlink_to(squeezenet)
         os.environ["DEEPSIMBAD_WEIGHTS_DIR"] = str(weights)
         splits = [*railway(data, work), *corridor(data), *campus(work / "campus")]
-        write_page("extractors.md", report(splits, work))
+        yield from report(splits, work)
 
 
 if __name__ == "__main__":
-    main()
+    Command(__doc__).run(lambda _: print_page(lines(), RESULTS / "extractors.md"))

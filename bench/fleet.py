@@ -3,7 +3,6 @@
 Both have the same maps and the same robots, which see the same: every answer of the fleet has one to be equal to.
 """
 
-import argparse
 import contextlib
 import hashlib
 import json
@@ -12,9 +11,9 @@ import random
 import shutil
 import signal
 import sys
-import tempfile
 import threading
 import time
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from bench.link import GoneError, Link, RefusedError
-from bench.measurement import duration, machine, markdown, write_page
+from bench.measurement import RESULTS, Command, duration, machine, markdown, print_page, work_folder
 from deepsimbad.jobs.versions import import_map
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.map_file import export_map
@@ -108,7 +107,7 @@ def replicas() -> list[int]:
     return pids
 
 
-def measured(url: str, arguments: argparse.Namespace, kill_every_s: float | None) -> Run:
+def measured(url: str, arguments: Namespace, kill_every_s: float | None) -> Run:
     """Let the robots drive; a replica is killed every `kill_every_s` seconds; None: none is."""
     run, stopped, draws = Run(), threading.Event(), random.Random(1)
     with Link(url) as link:
@@ -175,11 +174,10 @@ def make_domains(data_dir: Path, n_domains: int, n_images: int) -> None:
         import_map(catalog, files[1 % len(files)], "route-0")
 
 
-def report(arguments: argparse.Namespace) -> Iterator[str]:
+def report(arguments: Namespace) -> Iterator[str]:
     """Markdown lines."""
-    folder = Path(tempfile.mkdtemp(prefix="bench-fleet-"))
     settings = {"DEEPSIMBAD_MAX_SESSIONS": "100000", "DEEPSIMBAD_LOG_LEVEL": "WARNING"}
-    try:
+    with work_folder() as folder:
         make_domains(folder / "plain", arguments.domains, arguments.images)
         shutil.copytree(folder / "plain", folder / "fleet")
         with LocalServer(folder / "plain", folder / "plain.log", settings) as server:
@@ -194,8 +192,6 @@ def report(arguments: argparse.Namespace) -> Iterator[str]:
             switches = switched_s(server.url)
             calm_s = time.perf_counter() - start_s
             fleet = measured(server.url, arguments, arguments.kill_every_s)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     views = plain.digests.keys() & fleet.digests.keys()
     n_wrong = sum(plain.digests[view] != fleet.digests[view] for view in views)
     yield "# A fleet whose replicas die"
@@ -243,18 +239,13 @@ def quantile(seconds: list[float], share: float) -> float:
     return float(np.quantile(seconds, share)) if seconds else float("nan")
 
 
-def main() -> None:
-    """Measure as the command line asks, and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m bench.fleet", description=__doc__)
-    parser.add_argument("--domains", type=int, default=200)
-    parser.add_argument("--images", type=int, default=200)
-    parser.add_argument("--robots", type=int, default=50)
-    parser.add_argument("--replicas", type=int, default=4)
-    parser.add_argument("--seconds", type=float, default=180.0)
-    parser.add_argument("--kill-every-s", type=float, default=20.0)
-    parser.add_argument("--every-s", type=float, default=2.0, help="between two observations of a robot")
-    write_page("fleet.md", report(parser.parse_args()))
-
-
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("--domains", type=int, default=200)
+    command.add_argument("--images", type=int, default=200)
+    command.add_argument("--robots", type=int, default=50)
+    command.add_argument("--replicas", type=int, default=4)
+    command.add_argument("--seconds", type=float, default=180.0)
+    command.add_argument("--kill-every-s", type=float, default=20.0)
+    command.add_argument("--every-s", type=float, default=2.0, help="between two observations of a robot")
+    command.run(lambda arguments: print_page(report(arguments), RESULTS / "fleet.md"))

@@ -3,10 +3,8 @@
 Both run at once and are asked in turn: docs/results/fleet-encoder.md.
 """
 
-import argparse
 import os
 import shutil
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +13,17 @@ import cv2
 import numpy as np
 
 from bench.link import Link
-from bench.measurement import Timing, duration, interleaved, machine, markdown, write_page
+from bench.measurement import (
+    RESULTS,
+    Command,
+    Timing,
+    duration,
+    interleaved,
+    machine,
+    markdown,
+    print_page,
+    work_folder,
+)
 from deepsimbad.settings import MEBIBYTE
 from deepsimbad_client.http.local_server import LocalServer
 
@@ -94,9 +102,8 @@ def at_once(url: str) -> Callable[[], None]:
 
 def report(n_repeats: int) -> Iterator[str]:
     """Markdown lines."""
-    folder = Path(tempfile.mkdtemp(prefix="bench-encoder-"))
-    store = f"file://{folder}/store"
-    try:
+    with work_folder() as folder:
+        store = f"file://{folder}/store"
         make_domain(folder / "encoders-1")
         shutil.copytree(folder / "encoders-1", folder / "encoders-0")
         plain, without_encoder, with_encoder = (
@@ -118,8 +125,6 @@ def report(n_repeats: int) -> Iterator[str]:
                 [memory(server.pid, title) for title in ("domains-", "admin", "encoder")]
                 for server in (without_encoder, with_encoder)
             ]
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     yield "# One encoder for a fleet"
     yield ""
     yield (
@@ -151,12 +156,7 @@ def report(n_repeats: int) -> Iterator[str]:
     yield from markdown(("", "plain service", "fleet, networks of their own", "fleet, one encoder"), rows)
 
 
-def main() -> None:
-    """Measure as the command line asks, and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m bench.fleet_encoder", description=__doc__)
-    parser.add_argument("--repeats", type=int, default=200, help="images of the robot that is alone")
-    write_page("fleet-encoder.md", report(parser.parse_args().repeats))
-
-
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("--repeats", type=int, default=200, help="images of the robot that is alone")
+    command.run(lambda arguments: print_page(report(arguments.repeats), RESULTS / "fleet-encoder.md"))

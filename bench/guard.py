@@ -7,34 +7,28 @@ FOLDER keeps the encodings for the next run; rendering and encoding take most of
 """
 
 import math
-import sys
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import machine, markdown, real_recordings, write_page
+from bench.measurement import RESULTS, Command, machine, markdown, print_page, work_folder
+from bench.recordings import NETVLAD, encoded, netvlad_drives, real_recordings
 from deepsimbad.core.descriptor import LandmarkStatistics, rank_landmarks
-from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, judge
+from deepsimbad.core.drive import LEAST_CORRELATION, LEAST_PLACES, SIGNIFICANCE, Drive, judge
 from deepsimbad.core.landmark_model import select_landmarks
-from deepsimbad.core.route import Route, same_places
+from deepsimbad.core.route import same_places
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.image import decode_image
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad_campus.writer import write_campus
-from deepsimbad_client.recordings.sources import open_source
 
 EXTRACTORS = ("gradient_grid", "efficientnet_lite0")
-NETVLAD = ("nr", "nq", "nq2")
 SEASONS = ("summer", "winter")
 N_LANDMARKS = 300
 PAIRS = 300  # of every kind
 SHORTEST, LONGEST = 60, 300  # frames of a slice
 OLD_LEAST_CORRELATION = 0.15  # of the rule that this one replaced
-MAX_PIXELS = 50_000_000
 CHOSEN_ON, REPORTED = "chosen on", "reported only"
 CAMPUS_FRAMES = dict.fromkeys(range(8), 160) | dict.fromkeys(range(8, 24), 100)  # by seed
 CAMPUSES = {CHOSEN_ON: (*range(4), *range(8, 16)), REPORTED: (*range(4, 8), *range(16, 24))}
@@ -42,65 +36,45 @@ SLICED_CAMPUSES = {CHOSEN_ON: range(4), REPORTED: range(4, 8)}  # long enough fo
 ROWS = {CHOSEN_ON: (0.0, 0.5), REPORTED: (0.5, 1.0)}  # share of a railway drive
 
 
-@dataclass(frozen=True)
-class Drive:
-    """Frames of a recording, as one drive.
+def slice_of(drive: Drive, first: int, stop: int) -> Drive:
+    """The drive's frames from `first` to before `stop`, which keep their positions."""
+    return drive.at(np.arange(first, stop))
 
-    Attributes:
-        frames: [n] their rows in all frames of the world.
-        position_m: [n] as the drive's own recorder would say.
-        x_m, y_m: [n] where known.
-    """
 
-    frames: NDArray[np.int64]
-    position_m: NDArray[np.float64]
-    x_m: NDArray[np.float64] | None = None
-    y_m: NDArray[np.float64] | None = None
+def restarted(drive: Drive) -> Drive:
+    """The same frames as a recording that begins with them: positions from 0, and no plane."""
+    return replace(drive, position_m=drive.position_m - drive.position_m[0], x_m=None, y_m=None)
 
-    def part(self, first: int, stop: int) -> "Drive":
-        """The drive's frames from `first` to before `stop`, which keep their positions."""
-        frames = slice(first, stop)
-        plane = [None if axis is None else axis[frames] for axis in (self.x_m, self.y_m)]
-        return Drive(self.frames[frames], self.position_m[frames], *plane)
 
-    def restarted(self) -> "Drive":
-        """The same frames as a recording that begins with them: positions from 0, and no plane."""
-        return Drive(self.frames, self.position_m - self.position_m[0])
-
-    def with_errors(self, error_m: NDArray[np.float64]) -> "Drive":
-        """The drive with errors [n] in its positions, in the plane along x; never backwards along the route."""
-        x_m = None if self.x_m is None else self.x_m + error_m
-        return Drive(self.frames, np.maximum.accumulate(self.position_m + error_m), x_m, self.y_m)
-
-    @property
-    def n_frames(self) -> int:
-        """n."""
-        return int(self.frames.size)
+def with_errors(drive: Drive, error_m: NDArray[np.float64]) -> Drive:
+    """The drive with errors [n] in its positions, in the plane along x; never backwards along the route."""
+    return replace(drive, position_m=np.maximum.accumulate(drive.position_m + error_m), x_m=drive.x_m + error_m)
 
 
 class World:
-    """Recordings under one encoder, every frame compared with every other once."""
+    """Recordings under one encoder, every frame compared with every other once.
 
-    def __init__(self, encodings: dict[str, NDArray[np.float32]], plane: dict[str, NDArray[np.float64]]) -> None:
-        self.encodings = np.concatenate(list(encodings.values())).astype(np.float32)
+    Attributes:
+        drives: By name; a frame's index is its row among all frames.
+    """
+
+    def __init__(self, drives: Mapping[str, Drive]) -> None:
+        first_rows = np.cumsum([0, *(drive.n_frames for drive in drives.values())])
+        self.drives = {
+            name: replace(drive, index=np.arange(first, first + drive.n_frames))
+            for (name, drive), first in zip(drives.items(), first_rows[:-1], strict=True)
+        }
+        encodings = np.concatenate([drive.encodings for drive in drives.values()])
         evaluator = FeatureL2("none")
-        self._dissimilarities = evaluator.dissimilarities(self.encodings, evaluator.fit_landmarks(self.encodings))
-        self.drives: dict[str, Drive] = {}
-        first = 0
-        for name, rows in encodings.items():
-            measured = plane.get(name, [np.arange(len(rows), dtype=np.float64)])
-            self.drives[name] = Drive(np.arange(first, first + len(rows)), *measured)
-            first += len(rows)
+        self._dissimilarities = evaluator.dissimilarities(encodings, evaluator.fit_landmarks(encodings))
 
     def verdicts(self, map_drive: Drive, other: Drive) -> tuple[bool, bool]:
         """Whether the old and the new rule take both for drives of one route; landmarks are of the other drive."""
-        encodings = self.encodings[other.frames]
-        landmarks = other.frames[select_landmarks(encodings, min(N_LANDMARKS, other.n_frames))]
+        landmarks = other.index[select_landmarks(other.encodings, min(N_LANDMARKS, other.n_frames))]
         map_dissimilarities, other_dissimilarities = (
-            self._dissimilarities[np.ix_(drive.frames, landmarks)] for drive in (map_drive, other)
+            self._dissimilarities[np.ix_(drive.index, landmarks)] for drive in (map_drive, other)
         )
-        map_route, other_route = (Route(drive.position_m, x_m=drive.x_m, y_m=drive.y_m) for drive in (map_drive, other))
-        places = same_places(other_route, map_route)
+        places = same_places(other.route(), map_drive.route())
         return _old_rule(map_dissimilarities, other_dissimilarities, places), judge(
             map_dissimilarities, other_dissimilarities, places, map_drive.position_m
         ).accepted
@@ -135,8 +109,10 @@ def railway_pairs(world: World, names: Sequence[str], part: str) -> Iterator[tup
         start = int(rng.integers(low, high - n_frames - gap + 1))
         starts = (start, start + gap) if rng.integers(2) else (start + gap, start)
         stops = (starts[0] + n_frames, starts[1] + n_frames)
-        map_drive, other = world.drives[first].part(starts[0], stops[0]), world.drives[second].part(starts[1], stops[1])
-        return map_drive.restarted(), other.restarted()
+        map_drive, other = (
+            slice_of(world.drives[name], *ends) for name, *ends in zip((first, second), starts, stops, strict=True)
+        )
+        return restarted(map_drive), restarted(other)
 
     def of_two(rng: np.random.Generator) -> tuple[str, str]:
         first, second = rng.choice(len(names), 2, replace=False)
@@ -145,16 +121,17 @@ def railway_pairs(world: World, names: Sequence[str], part: str) -> Iterator[tup
     def one_stretch(rng: np.random.Generator) -> tuple[Drive, Drive]:
         n_frames = length(rng, high - low)
         start = int(rng.integers(low, high - n_frames + 1))
-        first, second = (world.drives[name].part(start, start + n_frames) for name in of_two(rng))
+        first, second = (slice_of(world.drives[name], start, start + n_frames) for name in of_two(rng))
         return first, second
 
     def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = one_stretch(rng)
-        return first, second.with_errors(rng.integers(-1, 2, second.n_frames).astype(np.float64))
+        return first, with_errors(second, rng.integers(-1, 2, second.n_frames).astype(np.float64))
 
     def reversed_drive(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = one_stretch(rng)
-        return first.restarted(), Drive(second.frames[::-1], second.position_m[-1] - second.position_m[::-1])
+        backwards = second.at(np.arange(second.n_frames)[::-1])
+        return restarted(first), restarted(replace(backwards, position_m=-backwards.position_m))
 
     yield "two places of the railway, one season", False, lambda rng: two_places(rng, *(of_two(rng)[0],) * 2)
     yield "two places of the railway, two seasons", False, lambda rng: two_places(rng, *of_two(rng))
@@ -168,7 +145,7 @@ def overlapping(rng: np.random.Generator, map_drive: Drive, other: Drive) -> tup
     """The other drive reduced to half or more of its frames, 45 at least."""
     n_frames = int(rng.integers(min(max(45, other.n_frames // 2), other.n_frames), other.n_frames + 1))
     first = int(rng.integers(0, other.n_frames - n_frames + 1))
-    return map_drive, other.part(first, first + n_frames)
+    return map_drive, slice_of(other, first, first + n_frames)
 
 
 def corridor_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
@@ -180,8 +157,8 @@ def corridor_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
         n_frames = int(rng.integers(SHORTEST, corridor.n_frames + 1))
         first = int(rng.integers(0, corridor.n_frames - n_frames + 1))
         start = int(rng.integers(low, high - n_frames + 1))
-        railway = world.drives[f"nordland_{SEASONS[rng.integers(2)]}"].part(start, start + n_frames)
-        drives = corridor.part(first, first + n_frames).restarted(), railway.restarted()
+        railway = slice_of(world.drives[f"nordland_{SEASONS[rng.integers(2)]}"], start, start + n_frames)
+        drives = restarted(slice_of(corridor, first, first + n_frames)), restarted(railway)
         return drives if rng.integers(2) else drives[::-1]
 
     yield "corridor and railway", False, corridor_and_railway
@@ -198,7 +175,7 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
     def two_campuses(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = (drive(rng, int(seed)) for seed in rng.choice(seeds, 2, replace=False))
         n_frames = int(rng.integers(SHORTEST, min(first.n_frames, second.n_frames) + 1))
-        return first.part(0, n_frames).restarted(), second.part(0, n_frames).restarted()
+        return restarted(slice_of(first, 0, n_frames)), restarted(slice_of(second, 0, n_frames))
 
     def two_slices(rng: np.random.Generator) -> tuple[Drive, Drive]:
         seed = int(rng.choice(sliced))
@@ -206,30 +183,32 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
         n_frames = int(rng.integers(SHORTEST, min(first.n_frames, second.n_frames) // 2 + 1))
         start = int(rng.integers(0, min(first.n_frames, second.n_frames) - 2 * n_frames + 1))
         gap = int(rng.integers(n_frames, min(first.n_frames, second.n_frames) - start - n_frames + 1))
-        drives = first.part(start, start + n_frames), second.part(start + gap, start + gap + n_frames)
-        ordered = drives if rng.integers(2) else drives[::-1]
-        return ordered[0].restarted(), ordered[1].restarted()
+        drives = (
+            restarted(slice_of(first, start, start + n_frames)),
+            restarted(slice_of(second, start + gap, start + gap + n_frames)),
+        )
+        return drives if rng.integers(2) else drives[::-1]
 
     def one_stretch(rng: np.random.Generator) -> tuple[Drive, Drive]:
         seed, season = int(rng.choice(seeds)), int(rng.integers(2))
         first, second = drive(rng, seed, season), drive(rng, seed, 1 - season)
         n_frames = int(rng.integers(SHORTEST, first.n_frames + 1))
         start = int(rng.integers(0, first.n_frames - n_frames + 1))
-        return first.part(start, start + n_frames), second
+        return slice_of(first, start, start + n_frames), second
 
     def inexact(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = one_stretch(rng)
-        return first, second.with_errors(rng.normal(0, 1.5, second.n_frames))
+        return first, with_errors(second, rng.normal(0, 1.5, second.n_frames))
 
     def adrift(rng: np.random.Generator) -> tuple[Drive, Drive]:
         first, second = one_stretch(rng)
         walk = np.cumsum(rng.normal(0, 0.3, second.n_frames))
-        return first, second.with_errors(np.clip(walk - walk.mean(), -3, 3))
+        return first, with_errors(second, np.clip(walk - walk.mean(), -3, 3))
 
     def in_part(rng: np.random.Generator) -> tuple[Drive, Drive]:
         map_drive, other = one_stretch(rng)
         first, stop = np.searchsorted(other.position_m, map_drive.position_m[[0, -1]])
-        return overlapping(rng, map_drive, other.part(int(first), int(stop)))
+        return overlapping(rng, map_drive, slice_of(other, int(first), int(stop)))
 
     yield "two rendered campuses", False, two_campuses
     yield "two places of one rendered campus", False, two_slices
@@ -239,46 +218,39 @@ def campus_pairs(world: World, part: str) -> Iterator[tuple[str, bool, Draw]]:
     yield "one stretch of a rendered campus, overlap in part", True, in_part
 
 
-def worlds(folder: Path, data: Path) -> Iterator[tuple[str, World]]:
+def worlds(folder: Path) -> Iterator[tuple[str, World]]:
     """The railway in three seasons as ready NetVLAD encodings, then all images under every extractor."""
-    yield "netvlad", World({name: np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in NETVLAD}, {})
+    yield "netvlad", World(dict(zip(NETVLAD, netvlad_drives(), strict=True)))
     for extractor in EXTRACTORS:
-        arrays = {path.name.split(".")[0]: np.load(path) for path in sorted(folder.glob(f"*.{extractor}.npz"))}
-        plane = {name: np.stack([rows[axis] for axis in "pxy"]) for name, rows in arrays.items() if "p" in rows.files}
-        yield extractor, World({name: rows["e"] for name, rows in arrays.items()}, plane)
+        drives = {}
+        for path in sorted(folder.glob(f"*.{extractor}.npz")):
+            with np.load(path) as arrays:
+                drives[path.name.split(".")[0]] = Drive(**arrays)
+        yield extractor, World(drives)
 
 
 def encode(folder: Path, data: Path) -> None:
     """Encode every recording that the folder lacks."""
-    evaluators = {
-        name: make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": name})) for name in EXTRACTORS
-    }
 
     def is_there(name: str) -> bool:
         return all((folder / f"{name}.{extractor}.npz").exists() for extractor in EXTRACTORS)
 
-    def keep(name: str, bodies: Iterable[bytes], **plane: NDArray[np.float64]) -> None:
-        images = [decode_image(body, MAX_PIXELS) for body in bodies]
-        for extractor, evaluator in evaluators.items():
-            rows = np.concatenate([evaluator.encode(images[first : first + 64]) for first in range(0, len(images), 64)])
-            np.savez(folder / f"{name}.{extractor}.npz", e=rows, **plane)
+    def keep(name: str, source: str) -> None:
+        for extractor in EXTRACTORS:
+            drive = encoded(source, extractor)
+            arrays = {of: getattr(drive, of) for of in ("encodings", "position_m", "x_m", "y_m")}
+            np.savez(folder / f"{name}.{extractor}.npz", **arrays)
 
-    folders = {f"nordland_{season}": data / "nordland" / season for season in SEASONS}
-    folders |= {f"corridor_{walk}": data / "corridor" / walk for walk in ("ref", "query")}
-    for name, pictures in folders.items():
-        if not is_there(name):
-            paths = sorted(path for path in pictures.iterdir() if path.suffix in {".png", ".jpg"})
-            keep(name, (path.read_bytes() for path in paths))
+    for kind, walks in (("nordland", SEASONS), ("corridor", ("ref", "query"))):
+        for walk in walks:
+            if not is_there(f"{kind}_{walk}"):
+                keep(f"{kind}_{walk}", str(data / kind / walk))
     for seed, n_frames in CAMPUS_FRAMES.items():
         names = [f"campus{seed}_{season}" for season in SEASONS]
-        if all(map(is_there, names)):
-            continue
-        with tempfile.TemporaryDirectory() as root:
-            for name, source in zip(names, write_campus(Path(root), SEASONS, n_frames, seed), strict=True):
-                drive = open_source(source)
-                places = np.array([(frame.position_m, frame.x_m, frame.y_m) for frame in drive.frames], np.float64)
-                bodies = (drive.image(frame, (224, 224)).body for frame in drive.frames)
-                keep(name, bodies, **dict(zip("pxy", places.T, strict=True)))
+        if not all(map(is_there, names)):
+            with work_folder() as root:
+                for name, source in zip(names, write_campus(root, SEASONS, n_frames, seed), strict=True):
+                    keep(name, source)
 
 
 @dataclass(frozen=True)
@@ -293,7 +265,7 @@ class Row:
     n_new: int
 
 
-def measure(world: World, encoder: str, part: str) -> Iterator[Row]:
+def rows_of(world: World, encoder: str, part: str) -> Iterator[Row]:
     """Every kind's row."""
     names = NETVLAD if encoder == "netvlad" else [f"nordland_{season}" for season in SEASONS]
     kinds = list(railway_pairs(world, names, part))
@@ -332,7 +304,7 @@ def shortfalls(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def report(rows: Sequence[Row]) -> list[str]:
-    """The whole document."""
+    """The lines of the page."""
     lines = [
         "# The guard of the second season",
         "",
@@ -340,6 +312,9 @@ def report(rows: Sequence[Row]) -> list[str]:
         "([0015](../decisions/0015-same-route.md)). Here the positions of every pair are said to be comparable, so the "
         f"test alone decides; it asks for a significance of {SIGNIFICANCE:g} and a mean correlation of at least "
         f"{LEAST_CORRELATION:g}. The old rule: a mean correlation of at least {OLD_LEAST_CORRELATION:g}.",
+        "",
+        "Dissimilarities are squared L2 to landmarks by the paper's rule, as a remap judges for every relevance but "
+        "`composed`: for that, the default, it judges unit vectors and landmarks chosen farthest first.",
         "",
         f"Slices of {SHORTEST} to {LONGEST} frames (of {len(CAMPUS_FRAMES)} campuses up to 155), r at most "
         f"{N_LANDMARKS}, {PAIRS} pairs of every kind. The 95 % intervals take pairs as independent; slices overlap, so "
@@ -366,16 +341,16 @@ def report(rows: Sequence[Row]) -> list[str]:
     return [*lines, "", "## What falls short", "", hidden, "", *shortfalls(rows)]
 
 
-def main() -> None:
+def measure(folder: Path | None) -> None:
     """Measure, print, write `docs/results/guard.md`."""
     data = real_recordings()
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(scratch)
-        folder.mkdir(parents=True, exist_ok=True)
-        encode(folder, data)
-        rows = [row for name, world in worlds(folder, data) for part in ROWS for row in measure(world, name, part)]
-    write_page("guard.md", report(rows))
+    with work_folder(folder) as work:
+        encode(work, data)
+        rows = [row for name, world in worlds(work) for part in ROWS for row in rows_of(world, name, part)]
+    print_page(report(rows), RESULTS / "guard.md")
 
 
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("folder", type=Path, nargs="?", metavar="FOLDER")
+    command.run(lambda arguments: measure(arguments.folder))

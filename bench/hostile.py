@@ -8,7 +8,6 @@ import io
 import json
 import socket
 import struct
-import tempfile
 import threading
 import time
 import zipfile
@@ -23,7 +22,7 @@ import numpy as np
 
 from bench.link import BINARY, JSON, Link
 from bench.load import Sample
-from bench.measurement import machine, markdown
+from bench.measurement import Command, machine, markdown, print_page, work_folder
 from bench.robots import LiveRobot, drive
 from bench.soak.actor import BASE, DOMAIN, N_LANDMARKS, make_domain
 from deepsimbad_client.http.local_server import LocalServer
@@ -185,9 +184,11 @@ def large_crowd(url: str, pid: int) -> tuple[tuple[str, str], Counter[str], floa
     return robot_times, verdicts, int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
-def hostile_table() -> Iterator[str]:
-    """Markdown lines."""
-    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
+def report() -> Iterator[str]:
+    """The lines of the page."""
+    yield from ("# Hostile and broken senders", "", "Made by `python -m bench.hostile`, with the default limits.")
+    yield from ("`tests/contract/test_hostile.py` has more of them, with shorter limits.", "", machine(), "")
+    with work_folder() as folder, LocalServer(folder / "data") as server:
         port = int(server.url.rpartition(":")[2])
         with Link(server.url) as link:
             make_domain(link)
@@ -219,13 +220,5 @@ def hostile_table() -> Iterator[str]:
     )
 
 
-def main() -> None:
-    """Print the page."""
-    print("# Hostile and broken senders\n\nMade by `python -m bench.hostile`, with the default limits.")
-    print(f"`tests/contract/test_hostile.py` has more of them, with shorter limits.\n\n{machine()}\n")
-    for line in hostile_table():
-        print(line, flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    Command(__doc__).run(lambda _: print_page(report()))

@@ -2,32 +2,25 @@
 
 import itertools
 import lzma
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bench.measurement import ACTIONS_M, Limit, limit_table, markdown, real_recordings
+from bench.measurement import ACTIONS_M, Limit, limit_table, markdown, work_folder
+from bench.recordings import encoded, netvlad_drives, real_recordings
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES, dense_lists, rrf_map, scattered_lists
-from deepsimbad.core.building import MapPlan
+from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.packing import pack_lists, unpack_lists
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import Relevance
-from deepsimbad.evaluators.base import Evaluator
-from deepsimbad.evaluators.compute import Compute
-from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build import build, encode_recording
-from deepsimbad.store.map_file import index_bytes, seal, write_map
+from deepsimbad.jobs.experiments.vpr import bits_per_map_image
 from deepsimbad_campus.writer import write_campus
-from deepsimbad_client.recordings.sources import open_source
 
-DRIVES, N_FRAMES, SEED = ("nr", "nq", "nq2"), 400, 1
+N_FRAMES, SEED = 400, 1
 _MARGIN = 1.1  # of the smaller order-1 model
 
 
@@ -72,34 +65,24 @@ def _random_prototypes() -> NDArray[np.float32]:
 
 def _maps() -> Iterator[tuple[str, list[Map]]]:
     """Maps by name, several of one kind."""
-    folder, ready = real_recordings(), FeatureL2("none")
-    seasons = {name: np.load(folder / "nordland_netvlad64" / f"{name}.npy").astype(np.float32) for name in DRIVES}
-    drives = {name: Drive(position_m=np.arange(float(len(rows))), encodings=rows) for name, rows in seasons.items()}
+    drives = netvlad_drives()
     for r in (300, 512):
-        pairs = itertools.permutations(drives.values(), 2)
-        yield (
-            "Nordland, NetVLAD, two seasons, mean of six",
-            [_map(drive, other, other, r, ready) for other, drive in pairs],
-        )
-    network = make_evaluator(evaluator_config({"kind": "feature_l2"}), Compute())
-    railway = _encoded(f"{folder / 'nordland' / 'summer'}#0:1000", network)
-    yield "Nordland, images, its own landmarks", [_map(railway, None, railway, 300, network)]
-    with tempfile.TemporaryDirectory() as work:
-        sources = write_campus(Path(work), ("winter", "spring"), N_FRAMES, SEED, spacing_m=0.5)
-        winter, spring = (_encoded(source, network) for source in sources)
-    yield "campus, 0.5 m, two seasons", [_map(spring, winter, winter, 300, network)]
-    yield "campus, 0.5 m, its own landmarks", [_map(spring, None, spring, 300, network)]
+        pairs = itertools.permutations(drives, 2)
+        yield "Nordland, NetVLAD, two seasons, mean of six", [_map(drive, other, r) for other, drive in pairs]
+    railway = encoded(real_recordings() / "nordland" / "summer#0:1000")
+    yield "Nordland, images, its own landmarks", [_map(railway, None, 300)]
+    with work_folder() as work:
+        winter, spring = map(encoded, write_campus(work, ("winter", "spring"), N_FRAMES, SEED, spacing_m=0.5))
+    yield "campus, 0.5 m, two seasons", [_map(spring, winter, 300)]
+    yield "campus, 0.5 m, its own landmarks", [_map(spring, None, 300)]
     for name, lists in (("drifting", dense_lists(NCLT_IMAGES)), ("drawn at random", scattered_lists(NCLT_IMAGES))):
         yield f"synthetic, {name}", [rrf_map(lists, landmark_model={"prototypes": _random_prototypes()})]
 
 
-def _encoded(source: str, evaluator: Evaluator) -> Drive:
-    return encode_recording(open_source(source), evaluator, 10**8, lambda _: None).drive
-
-
-def _map(drive: Drive, second: Drive | None, landmarks: Drive, n_landmarks: int, evaluator: Evaluator) -> Map:
+def _map(drive: Drive, second: Drive | None, n_landmarks: int) -> Map:
+    """A map of a drive, with landmarks of the second one where there is one."""
     plan = MapPlan(Relevance.COMPOSED, 4, ACTIONS_M, same_route=second is not None)
-    return build(plan, drive, second, landmarks, n_landmarks, evaluator).map
+    return compose_map(plan, drive, second, second, n_landmarks).map
 
 
 def _bits(map_: Map) -> list[float]:
@@ -110,13 +93,9 @@ def _bits(map_: Map) -> list[float]:
     packed = (np.packbits(bits.astype(np.uint8)).tobytes(), lists.T.astype("<u2").tobytes())
     xz = min(len(lzma.compress(content, preset=9 | lzma.PRESET_EXTREME)) for content in packed)
     code = sum(map(len, pack_lists(lists, r, map_.landmark_model["prototypes"])))
-    with tempfile.TemporaryDirectory() as folder:
-        write_map(Path(folder) / "building", map_)
-        seal(Path(folder) / "building", Path(folder) / "sealed")
-        pages = index_bytes(Path(folder) / "sealed")
     wide_lists = lists.astype(np.int64)
     models = (_by_place(wide_lists, r) / n, _by_list(wide_lists, r) / n)
-    return [len(lists) * np.log2(r), *models, 8 * xz / n, 8 * code / n, 8 * pages / n]
+    return [len(lists) * np.log2(r), *models, 8 * xz / n, 8 * code / n, bits_per_map_image(map_)]
 
 
 @njit(cache=True)

@@ -14,21 +14,18 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import duration, machine, markdown, real_recordings, timed, write_page
-from bench.quantised import LIST_LENGTH, composed_places, k_means, netvlad_drives, row_of, scored
+from bench.measurement import RESULTS, Command, duration, figures, machine, markdown, print_page, scored, timed
+from bench.quantised import LIST_LENGTH, TOLERANCE, composed_places, k_means, session_scores
+from bench.recordings import encoded, netvlad_drives, real_recordings
 from deepsimbad.core import composed
 from deepsimbad.core.building import Built, MapPlan, compose_map
 from deepsimbad.core.composed import Moments, compose, described, learnt_landmarks, unit
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.landmark_model import farthest_first, select_landmarks
-from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build import encode_recording
-from deepsimbad_client.recordings.sources import open_source
 
-_MAX_PIXELS = 10_000_000
 _NUMBERS = (37, 75, 150, 300)  # r: a sixteenth of the NetVLAD places, an eighth, a quarter, a half
 _LENGTHS = (1_000, 5_000, 26_208)  # map images
 _N_LANDMARKS = 500
@@ -75,20 +72,20 @@ class Case:
         u = described(candidates.encodings, Moments.of(candidates.encodings), projection)
         return u[rule(u, r)]
 
+    def scores(self, built_map: Built, landmarks: NDArray[np.float32]) -> RetrievalScores:
+        """Scores of the test drive on lists of these landmarks [r, k]."""
+        restored = composed_places(compose(built_map.places, landmarks, LIST_LENGTH), landmarks)
+        return session_scores(built_map, restored, self.test)
+
 
 def cases() -> dict[str, list[Case]]:
     """Cases of real recordings, by the name of their set."""
-    drives = netvlad_drives()
-    folder, evaluator = real_recordings(), make_evaluator(evaluator_config({"kind": "feature_l2"}))
-
-    def encoded(source: str) -> Drive:
-        return encode_recording(open_source(str(folder / source)), evaluator, _MAX_PIXELS, lambda _: None).drive
-
-    query, reference = encoded("corridor/query"), encoded("corridor/ref")
-    summer, winter = encoded("nordland/summer#0:600"), encoded("nordland/winter#0:600")
+    drives, folder = netvlad_drives(), real_recordings()
+    query, reference = (encoded(folder / "corridor" / name) for name in ("query", "ref"))
+    summer, winter = (encoded(folder / "nordland" / f"{season}#0:600") for season in ("summer", "winter"))
     return {
-        "NetVLAD, two seasons": [Case(m, t, second) for second, m, t in itertools.permutations(drives.values())],
-        "NetVLAD, one season": [Case(m, t) for m, t in itertools.permutations(drives.values(), 2)],
+        "NetVLAD, two seasons": [Case(m, t, second) for second, m, t in itertools.permutations(drives)],
+        "NetVLAD, one season": [Case(m, t) for m, t in itertools.permutations(drives, 2)],
         "Nordland images, one season": [Case(summer, winter), Case(winter, summer)],
         "corridor, one season": [Case(reference, query), Case(query, reference)],
     }
@@ -109,10 +106,9 @@ def accuracy(all_cases: dict[str, list[Case]]) -> Iterator[str]:
                     landmarks = case.landmarks(built_map, RULES.get(rule, farthest_first), n_landmarks)
                     if rule != AS_CHOSEN:
                         landmarks = learnt_landmarks(built_map.places, landmarks, LIST_LENGTH)
-                    restored = composed_places(compose(built_map.places, landmarks, LIST_LENGTH), landmarks)
-                    per_rule[-1].append(scored(built_map, restored, case.test))
+                    per_rule[-1].append(case.scores(built_map, landmarks))
         for rule, by_r in scores.items():
-            cells = (row_of(scores_of_r) for scores_of_r in by_r)
+            cells = (figures(scores_of_r) for scores_of_r in by_r)
             rows.append([name, rule, *(f"{anr} / {recall}" for anr, recall, _ in cells)])
     return markdown(("set", "landmarks by", *(f"r = {r}" for r in _NUMBERS)), rows)
 
@@ -185,35 +181,24 @@ def tried(set_cases: Sequence[Case], r: int) -> Iterator[str]:
         for name, (weights, lists) in ways.items():
             frozen = np.array(weights, np.float32)
             with patch.object(composed, "list_weights", lambda _, frozen=frozen: frozen):
-                rehearsals[name].append(rehearsed(case, built_map, landmarks, frozen, lists))
-                restored = weighted(lists(built_map.places, landmarks, None), landmarks, frozen)
-            tests[name].append(scored(built_map, restored, case.test))
-    rows = [[name, *row_of(rehearsals[name]), *row_of(tests[name])] for name in ways]
+                rehearsals[name].append(rehearsed(case, built_map, landmarks, lists))
+                restored = composed_places(lists(built_map.places, landmarks, None), landmarks)
+            tests[name].append(session_scores(built_map, restored, case.test))
+    rows = [[name, *figures(rehearsals[name]), *figures(tests[name])] for name in ways]
     titles = (f"{judge}: {figure}" for judge in ("rehearsal", "test") for figure in ("ANR %", "R@1 %", "worst"))
     return markdown(("lists by", *titles), rows)
 
 
-def weighted(
-    lists: NDArray[np.uint16], landmarks: NDArray[np.float32], weights: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """[n, k] directions of the weighted sums of lists [h, n]."""
-    return unit(np.einsum("h,hnk->nk", weights, landmarks[lists]))
-
-
-def rehearsed(
-    case: Case, built_map: Built, landmarks: NDArray[np.float32], weights: NDArray[np.float32], lists: Lists
-) -> RetrievalScores:
+def rehearsed(case: Case, built_map: Built, landmarks: NDArray[np.float32], lists: Lists) -> RetrievalScores:
     """Scores of the landmark drive on lists of the training drive alone, a place's own landmarks barred."""
     projection = built_map.map.landmark_model.get("projection")
     views, places = (
         described(drive.encodings, Moments.of(drive.encodings), projection) for drive in (case.second, case.training)
     )
     from_m = case.second.position_m[(landmarks @ views.T).argmax(axis=1)]
-    barred = np.abs(case.training.position_m[:, np.newaxis] - from_m) <= 2.0
-    restored, scorer = weighted(lists(places, landmarks, barred), landmarks, weights), RetrievalScorer()
-    for view, truth in zip(views, true_images_of(case.second.route(), case.training.route(), 2.0), strict=True):
-        scorer.add(restored @ view, truth)
-    return scorer.result()
+    barred = np.abs(case.training.position_m[:, np.newaxis] - from_m) <= TOLERANCE
+    restored = composed_places(lists(places, landmarks, barred), landmarks)
+    return scored(views @ restored.T, true_images_of(case.second.route(), case.training.route(), TOLERANCE))
 
 
 def report() -> Iterator[str]:
@@ -229,10 +214,7 @@ def report() -> Iterator[str]:
     yield from ("", "Made by `python -m bench.landmarks`.", "", machine())
     yield from ("", "## Accuracy", "", "ANR / R@1, percent.", "")
     yield from accuracy(all_cases)
-    yield from (
-        "",
-        "Longer routes: [long-route.md](long-route.md).",
-    )
+    yield from ("", "Longer routes: [long-route.md](long-route.md).")
     yield from ("", f"## Time to choose {_N_LANDMARKS}, made-up encodings of {composed.MOST_DIMENSIONS} numbers", "")
     yield from times()
     yield from ("", "## What was tried for lists", "")
@@ -244,10 +226,5 @@ def report() -> Iterator[str]:
     yield from tried(all_cases["NetVLAD, two seasons"], 300)
 
 
-def main() -> None:
-    """Measure, print, write `docs/results/landmarks.md`."""
-    write_page("landmarks.md", report())
-
-
 if __name__ == "__main__":
-    main()
+    Command(__doc__).run(lambda _: print_page(report(), RESULTS / "landmarks.md"))

@@ -3,12 +3,11 @@
 make load
 """
 
-import argparse
 import sys
-import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
+from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.link import GoneError, Link, RefusedError
-from bench.measurement import machine, markdown
+from bench.measurement import Command, machine, markdown, print_page, work_folder
 from deepsimbad_client.http.local_server import LocalServer
 
 N_ROBOTS, SESSION_LENGTH = 20, 120
@@ -259,30 +258,25 @@ def report(result: Load, observe_every_s: float) -> Iterator[str]:
         yield f"\n    {error}"
 
 
-def main() -> None:
-    """Run once and print the report."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--observe-every", type=float, default=1.0, metavar="SECONDS")
-    parser.add_argument("--remap-every", type=float, default=60.0, metavar="SECONDS")
-    parser.add_argument("--out", type=Path, help="write the report here as well")
-    arguments = parser.parse_args()
+def measure(arguments: Namespace) -> None:
+    """Run once and print the report; ends with 1 where there were errors."""
 
     def tell(result: Load) -> None:
-        sample = result.samples[-1]
-        print(
-            f"\r{len(result.observation_s)} observations, {sample.rss_mb:.0f} MB ", end="", file=sys.stderr, flush=True
-        )
+        progress = f"\r{len(result.observation_s)} observations, {result.samples[-1].rss_mb:.0f} MB "
+        print(progress, end="", file=sys.stderr, flush=True)
 
-    with tempfile.TemporaryDirectory() as folder:
+    with work_folder() as folder:
         paces = (60 * arguments.minutes, arguments.observe_every, arguments.remap_every)
-        result = load(Path(folder) / "data", *paces, on_sample=tell)
-    text = "\n".join(report(result, arguments.observe_every)) + "\n"
-    print(f"\n{text}", end="")
-    if arguments.out is not None:
-        arguments.out.write_text(text, encoding="utf-8")
+        result = load(folder / "data", *paces, on_sample=tell)
+    print(file=sys.stderr)
+    print_page(report(result, arguments.observe_every), arguments.out)
     sys.exit(1 if result.errors else 0)
 
 
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("--minutes", type=float, default=60.0)
+    command.add_argument("--observe-every", type=float, default=1.0, metavar="SECONDS")
+    command.add_argument("--remap-every", type=float, default=60.0, metavar="SECONDS")
+    command.add_argument("--out", type=Path, help="write the report here as well")
+    command.run(measure)

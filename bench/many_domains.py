@@ -7,10 +7,9 @@ The first writes docs/results/many-domains.md. The second makes a data directory
 on it and prints what start, memory, cold and warm answers take.
 """
 
-import argparse
 import os
-import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,17 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import ACTIONS_M, duration, machine, markdown, real_recordings, timed, write_page
+from bench.measurement import ACTIONS_M, RESULTS, Command, duration, machine, markdown, print_page, timed, work_folder
+from bench.recordings import encoded, netvlad_drives, real_recordings
 from bench.worlds import LIST_LENGTH, composed_map, scattered_lists
 from deepsimbad.core.atlas import Atlas, posterior
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.composed import unit
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.map import Map
-from deepsimbad.core.relevance import Relevance, shows_nothing
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.evaluators.compute import available_cores
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
-from deepsimbad.jobs.build import encode_recording
 from deepsimbad.store.catalog import Catalog
 from deepsimbad.store.layout import maps_folder, traverses_folder
 from deepsimbad.store.map_file import seal, write_map
@@ -39,7 +37,6 @@ from deepsimbad.store.records import current_moment
 from deepsimbad_campus.writer import write_campus
 from deepsimbad_client import Client
 from deepsimbad_client.http.local_server import LocalServer
-from deepsimbad_client.recordings.sources import open_source
 
 Encodings = NDArray[np.float32]
 PLAN = MapPlan(Relevance.COMPOSED, LIST_LENGTH, ACTIONS_M, same_route=True)
@@ -59,21 +56,21 @@ class World:
 # Whether it is right
 
 
-def composed_map_of(*seasons: Encodings) -> Map:
+def composed_map_of(*seasons: Drive) -> Map:
     """A map of one season of a route, or of two."""
-    drives = [Drive(position_m=np.arange(float(len(season))), encodings=season) for season in seasons]
-    second = drives[1] if len(drives) > 1 else None
-    return compose_map(PLAN, drives[0], second, second, min(300, len(seasons[0]) // 2)).map
+    second = seasons[1] if len(seasons) > 1 else None
+    return compose_map(PLAN, seasons[0], second, second, min(300, seasons[0].n_frames // 2)).map
 
 
-def pieces(name: str, maps: Sequence[Encodings], live: Encodings, length: int, step: int = 3) -> World:
+def pieces(name: str, maps: Sequence[Drive], live: Drive, length: int, step: int = 3) -> World:
     """Every other stretch of a route is a domain, and those between are none."""
-    stretches = range(0, len(live) - length + 1, length)
+    stretches = range(0, live.n_frames - length + 1, length)
     domains = {
-        f"{start}": composed_map_of(*(season[start : start + length] for season in maps)) for start in stretches[::2]
+        f"{start}": composed_map_of(*(season.at(np.arange(start, start + length)) for season in maps))
+        for start in stretches[::2]
     }
     views = [
-        (live[i], str(start) if str(start) in domains else None)
+        (live.encodings[i], str(start) if str(start) in domains else None)
         for start in stretches
         for i in range(start, start + length, step)
     ]
@@ -82,46 +79,36 @@ def pieces(name: str, maps: Sequence[Encodings], live: Encodings, length: int, s
 
 def worlds(data: Path, work: Path) -> Iterator[World]:
     """Worlds that the constants were not chosen on: seasons have exchanged their parts, the campuses are new."""
-    nr, nq, nq2 = (np.load(data / "nordland_netvlad64" / f"{name}.npy") for name in ("nr", "nq", "nq2"))
+    nr, nq, nq2 = netvlad_drives()
     yield pieces("railway by NetVLAD (64 numbers), stretches of 100, one season", (nq2,), nr, 100)
     yield pieces("the same, two seasons", (nq2, nq), nr, 100)
-    drives = {name: encoded(str(data / name)) for name in ("nordland/summer", "nordland/winter")}
-    summer, winter = drives.values()
-    dark = shows_nothing(lambda: [summer]) | shows_nothing(lambda: [winter])
-    summer, winter = summer[~dark], winter[~dark]
+    summer, winter = (encoded(data / "nordland" / season) for season in ("summer", "winter"))
+    shows_place = ~np.any([drive.shows_nothing | drive.is_unlike_all for drive in (summer, winter)], axis=0)
+    summer, winter = (drive.at(np.flatnonzero(shows_place)) for drive in (summer, winter))
     yield pieces("railway, 64 x 32 pixels, stretches of 200, map winter, live summer", (winter,), summer, 200, 4)
-    ref, query = (encoded(str(data / "corridor" / name)) for name in ("ref", "query"))
+    ref, query = (encoded(data / "corridor" / name) for name in ("ref", "query"))
     campuses = []
     for seed in (2, 3, 4):
-        folder = work / f"campus-{seed}"
-        campuses.append([encoded(source) for source in write_campus(folder, ("winter", "summer", "autumn"), 150, seed)])
-    maps = {f"campus {n}": composed_map_of(winter, summer) for n, (winter, summer, _) in enumerate(campuses[:2])}
-    maps |= {
-        "corridor": composed_map_of(query),
-        "railway, short": composed_map_of(winter[:150]),
-        "railway, long": composed_map_of(winter[300:1300]),
-    }
+        sources = write_campus(work / f"campus-{seed}", ("winter", "summer", "autumn"), 150, seed)
+        campuses.append([encoded(source) for source in sources])
+    railway = {"railway, short": composed_map_of(winter.at(np.arange(150)))}
+    railway["railway, long"] = composed_map_of(winter.at(np.arange(300, 1300)))
+    maps = {f"campus {n}": composed_map_of(*drives[:2]) for n, drives in enumerate(campuses[:2])}
+    maps |= {"corridor": composed_map_of(query), **railway}
+    railway_views = [(view, "railway, short") for view in summer.encodings[:150:5]]
+    railway_views += [(view, "railway, long") for view in summer.encodings[300:1300:20]]
     views = [
-        (view, f"campus {n}" if n < 2 else None) for n, (*_, autumn) in enumerate(campuses) for view in autumn[::3]
+        (view, f"campus {n}" if n < 2 else None)
+        for n, (*_, autumn) in enumerate(campuses)
+        for view in autumn.encodings[::3]
     ]
-    views += [(view, "corridor") for view in ref[::3]]
-    views += [(view, "railway, short") for view in summer[:150:5]] + [
-        (view, "railway, long") for view in summer[300:1300:20]
-    ]
-    views += [(view, None) for view in summer[1500::10]]
+    views += [(view, "corridor") for view in ref.encodings[::3]] + railway_views
+    views += [(view, None) for view in summer.encodings[1500::10]]
     yield World(
         "routes of different kinds: two campuses in two seasons, a corridor, a short and a long railway", maps, views
     )
-    railway = {name: maps[f"railway, {name}"] for name in ("short", "long")}
-    views = [(view, "short") for view in summer[:150:5]] + [(view, "long") for view in summer[300:1300:20]]
-    views += [(view, None) for view in (*ref[::3], *campuses[0][2][::3])]
+    views = railway_views + [(view, None) for view in (*ref.encodings[::3], *campuses[0][2].encodings[::3])]
     yield World("of these the railways alone, views of none are of the corridor and a campus", railway, views)
-
-
-def encoded(source: str) -> Encodings:
-    """[n, d] encodings of a source by the default extractor."""
-    evaluator = make_evaluator(evaluator_config({"kind": "feature_l2"}))
-    return encode_recording(open_source(source), evaluator, 50_000_000, lambda _: None).drive.encodings
 
 
 def quality_lines(data: Path, work: Path) -> Iterator[str]:
@@ -217,8 +204,10 @@ def speed_lines() -> Iterator[str]:
 
 def write_domains(data_dir: Path, n: int) -> None:
     """Domains of 200 map images each, straight into catalog and folders: distinct files, later hard links."""
-    encodings = np.random.default_rng(0).normal(size=(200, 64)).astype(np.float32)
-    map_ = replace(composed_map_of(encodings), evaluator={"kind": "feature_l2", "extractor": "none"})
+    drive = Drive(
+        position_m=np.arange(200.0), encodings=np.random.default_rng(0).normal(size=(200, 64)).astype(np.float32)
+    )
+    map_ = replace(composed_map_of(drive), evaluator={"kind": "feature_l2", "extractor": "none"})
     moment, digest, n_bytes = current_moment(), "", 0
     domains, versions = [], []
     with Catalog.open(data_dir) as catalog:
@@ -316,18 +305,20 @@ def page(data: Path, work: Path) -> Iterator[str]:
     yield from speed_lines()
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--domains", type=int)
-    parser.add_argument("--work", type=Path)
-    parser.add_argument("--speed", action="store_true", help="print the speed alone")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.work or Path(temporary)
+def measure(arguments: Namespace) -> None:
+    """Print what was asked for."""
+    with work_folder(arguments.work) as work:
         if arguments.speed:
-            print("\n".join(speed_lines()))
+            print_page(speed_lines())
         elif arguments.domains is not None:
-            for line in directory_lines(arguments.domains, folder):
-                print(line, flush=True)
+            print_page(directory_lines(arguments.domains, work))
         else:
-            write_page("many-domains.md", page(real_recordings(), folder))
+            print_page(page(real_recordings(), work), RESULTS / "many-domains.md")
+
+
+if __name__ == "__main__":
+    command = Command(__doc__)
+    command.add_argument("--domains", type=int)
+    command.add_argument("--work", type=Path)
+    command.add_argument("--speed", action="store_true", help="print the speed alone")
+    command.run(measure)

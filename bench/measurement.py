@@ -1,19 +1,64 @@
-"""What every measurement needs: the machine, medians, limits, the real recordings, the page it writes."""
+"""What every measurement needs: its command, the machine, medians, limits, the page it writes."""
 
 import math
 import os
 import platform
 import statistics
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from subprocess import CalledProcessError
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
+import numpy as np
+from numpy.typing import NDArray
+
+from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.errors import DeepSimbadError, nearest_of
+from deepsimbad_client.errors import DeepSimbadClientError
+
 PROJECT = Path(__file__).resolve().parent.parent
+RESULTS = PROJECT / "docs" / "results"
 ACTIONS_M = tuple(float(metres) for metres in range(1, 11))
+
+
+class Command(ArgumentParser):
+    """A measurement's command line, whose `--help` prints the module's docstring."""
+
+    def __init__(self, document: str | None) -> None:
+        module = ".".join(Path(sys.argv[0]).resolve().relative_to(PROJECT).with_suffix("").parts)
+        prog = f"python -m {module.removesuffix('.__main__')}"
+        super().__init__(prog=prog, description=document, formatter_class=RawDescriptionHelpFormatter)
+
+    def run(self, measure: Callable[[Namespace], object], words: Sequence[str] | None = None) -> None:
+        """Measure what the words ask for, None: those of the command line.
+
+        A file that is not there ends it with 2, an error of ours or of a command of ours with 1, in one line.
+        """
+        arguments = self.parse_args(words)
+        try:
+            measure(arguments)
+        except OSError as error:
+            self.exit(2, f"{self.prog}: {error}\n")
+        except (DeepSimbadError, DeepSimbadClientError, CalledProcessError) as error:
+            self.exit(1, f"{self.prog}: {error}\n")
+
+
+def one_of(names: Collection[str]) -> Callable[[str], str]:
+    """The type of an argument that is one of some names; of any number of them argparse takes no `choices`."""
+
+    def checked(word: str) -> str:
+        if word not in names:
+            raise ArgumentTypeError(f"there is no {word!r}{nearest_of(word, names)}")
+        return word
+
+    return checked
 
 
 def machine() -> str:
@@ -29,15 +74,24 @@ def machine() -> str:
     )
 
 
-def write_page(name: str, lines: Iterable[str]) -> None:
-    """Print the lines as they come, then write them as a page of docs/results."""
+def print_page(lines: Iterable[str], page: Path | None = None) -> None:
+    """Print the lines as they come, then write them to a page where one is given."""
     page_lines = []
     for line in lines:
         print(line, flush=True)
         page_lines.append(line)
-    page = PROJECT / "docs" / "results" / name
-    page.write_text("\n".join(page_lines) + "\n", encoding="utf-8")
-    print(f"written to {page}", file=sys.stderr)
+    if page is not None:
+        page.write_text("\n".join(page_lines) + "\n", encoding="utf-8")
+        print(f"written to {page}", file=sys.stderr)
+
+
+@contextmanager
+def work_folder(folder: Path | None = None) -> Iterator[Path]:
+    """A folder to work in, made where it is not there; None: a temporary one."""
+    with TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+        work = folder or Path(temporary)
+        work.mkdir(parents=True, exist_ok=True)
+        yield work
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
@@ -89,16 +143,18 @@ def _seconds(run: Callable[[], object]) -> float:
     return perf_counter() - start_s
 
 
-def real_recordings() -> Path:
-    """The folder named by DEEPSIMBAD_REAL_DATA, else `../shared/data` beside the project.
+def scored(rows: Iterable[NDArray[np.floating]], truths: Iterable[NDArray[np.int64]]) -> RetrievalScores:
+    """Scores of the relevances [n] to every view, whose true images these are."""
+    scorer = RetrievalScorer()
+    for row, true_images in zip(rows, truths, strict=True):
+        scorer.add(row, true_images)
+    return scorer.result()
 
-    Raises:
-        FileNotFoundError: There is none.
-    """
-    folder = Path(os.environ.get("DEEPSIMBAD_REAL_DATA", PROJECT.parent / "shared" / "data"))
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no real recordings at {folder}: set DEEPSIMBAD_REAL_DATA to their folder")
-    return folder
+
+def figures(scores: Sequence[RetrievalScores]) -> list[str]:
+    """Mean ANR and R@1, and the worst ANR, in percent."""
+    anr = [score.anr for score in scores]
+    return [f"{np.mean(anr):.2f}", f"{np.mean([score.recall_at[1] for score in scores]):.1f}", f"{max(anr):.2f}"]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.measurement import Timing, interleaved, machine, markdown, write_page
+from bench.measurement import RESULTS, Command, Timing, interleaved, machine, markdown, print_page
 from deepsimbad.evaluators.compute import Compute, Device, Runtime
 from deepsimbad.evaluators.nets.netvlad import STAGES, NetVlad
 from deepsimbad.evaluators.runtimes import make_run
@@ -167,4 +167,4 @@ def report() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    write_page("netvlad-speed.md", report())
+    Command(__doc__).run(lambda _: print_page(report(), RESULTS / "netvlad-speed.md"))

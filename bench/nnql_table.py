@@ -10,24 +10,22 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import ACTIONS_M, machine, markdown, real_recordings
+from bench.measurement import ACTIONS_M, Command, machine, markdown, print_page
+from bench.recordings import NETVLAD, netvlad_drives
 from deepsimbad.core.building import Built, MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.experience.nnql import NnqlConfig, initial_q_values
 from deepsimbad.core.experience.training import TrainingWorld, Walk, train, walk_greedily
 from deepsimbad.core.metrics import mean_interval
 from deepsimbad.core.relevance import Relevance, UpdateRule
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.build import build, measure_drive, train_nnql, world_of
 
-DRIVES = ("nr", "nq", "nq2")
-TRIPLETS = tuple(itertools.permutations(DRIVES))
 N_LANDMARKS, LIST_LENGTH, N_STARTS = 300, 4, 2000
 LANDMARK_DRIVE, HELD_OUT, ITSELF, TEST_DRIVE = "landmark traverse", "held-out frames", "map images", "test traverse"
 
@@ -50,18 +48,15 @@ OURS = Setup("ours: composed, log-likelihood", Relevance.COMPOSED, UpdateRule.LO
 class Triplet:
     """One landmark-training-test triplet under one set-up, mapped."""
 
-    folder: Path
-    names: tuple[str, ...]
+    drives: Sequence[Drive]
     setup: Setup
 
     @cached_property
     def _map_and_drives(self) -> tuple[Built, list[Drive]]:
-        evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "none"}))
-        encodings = [np.load(self.folder / f"{name}.npy").astype(np.float32) for name in self.names]
-        drives = [Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in encodings]
-        plan = MapPlan(self.setup.relevance, LIST_LENGTH, tuple(ACTIONS_M), same_route=True)
-        built_map = build(plan, drives[1], drives[0], drives[0], N_LANDMARKS, evaluator)
-        return built_map, [measure_drive(drive, built_map.map.landmark_model, evaluator) for drive in drives]
+        evaluator, (landmarks, training, _) = FeatureL2("none"), self.drives
+        plan = MapPlan(self.setup.relevance, LIST_LENGTH, ACTIONS_M, same_route=True)
+        built_map = build(plan, training, landmarks, landmarks, N_LANDMARKS, evaluator)
+        return built_map, [measure_drive(drive, built_map.map.landmark_model, evaluator) for drive in self.drives]
 
     def learn(self, live: str, config: NnqlConfig, pool: Executor) -> NDArray[np.float32]:
         """Q-values learnt from some live images; `held-out frames` and `landmark traverse` as a remap does."""
@@ -177,13 +172,11 @@ def difference(scores: NDArray[np.float64], rival_scores: NDArray[np.float64]) -
     return f"{mark}{differences.mean():+.3f}{mark} ({low:+.3f} .. {high:+.3f})"
 
 
-def setup_lines(folder: Path, setup: Setup, pool: Executor) -> Iterator[str]:
+def setup_lines(drives: Sequence[Drive], setup: Setup, pool: Executor) -> Iterator[str]:
     """The tables of one set-up."""
-    config, triplets = NnqlConfig(), [Triplet(folder, names, setup) for names in TRIPLETS]
-    names, worlds = (
-        ["-".join(triplet.names) for triplet in triplets],
-        [triplet.test_world(config) for triplet in triplets],
-    )
+    config, triplets = NnqlConfig(), [Triplet(order, setup) for order in itertools.permutations(drives)]
+    names = ["-".join(order) for order in itertools.permutations(NETVLAD)]
+    worlds = [triplet.test_world(config) for triplet in triplets]
     unlearnt = [initial_q_values(world.n_images, world.n_actions, config) for world in worlds]  # random moves
     random = np.stack([greedy(world, values, config, pool) for world, values in zip(worlds, unlearnt, strict=True)])
     constants = np.stack([[constant(world, action, pool) for world in worlds] for action in range(10)])
@@ -236,8 +229,9 @@ def setup_lines(folder: Path, setup: Setup, pool: Executor) -> Iterator[str]:
     yield ""
 
 
-def report(folder: Path) -> Iterator[str]:
+def report() -> Iterator[str]:
     """The lines of the page."""
+    drives = netvlad_drives()
     yield from ("# When NNQL beats random and constant moves", "")
     yield (
         "Nearest-neighbour Q-learning (II-D) on three drives of the Nordland route, 600 places, 64-d NetVLAD, all six "
@@ -250,9 +244,8 @@ def report(folder: Path) -> Iterator[str]:
     yield from ("", "Made by `python -m bench.nnql_table`.", "", machine(), "")
     with ThreadPoolExecutor(2) as pool:
         for setup in (PAPER, OURS):
-            yield from setup_lines(folder, setup, pool)
+            yield from setup_lines(drives, setup, pool)
 
 
 if __name__ == "__main__":
-    for line in report(real_recordings() / "nordland_netvlad64"):
-        print(line, flush=True)
+    Command(__doc__).run(lambda _: print_page(report()))

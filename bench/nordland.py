@@ -8,7 +8,6 @@ most 8 (of the map's frames in either season, of the landmarks' in summer, the o
 is one metre; a match within two frames is right.
 """
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,8 @@ from typing import Any
 
 import cv2
 
-from bench.measurement import machine, markdown, real_recordings, write_page
+from bench.measurement import RESULTS, Command, machine, markdown, print_page, work_folder
+from bench.recordings import real_recordings
 from deepsimbad_client import Client
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.local_server import LocalServer
@@ -148,12 +148,12 @@ def report(measured: Measured) -> Iterator[str]:
     )
 
 
-def main() -> None:
-    """Measure, print, write `docs/results/nordland-http.md`."""
-    with tempfile.TemporaryDirectory() as work:
-        measured = measure(real_recordings() / "nordland", Path(work))
-    write_page("nordland-http.md", report(measured))
+def lines() -> Iterator[str]:
+    """Measure; the lines of the page."""
+    nordland = real_recordings() / "nordland"
+    with work_folder() as work:
+        yield from report(measure(nordland, work))
 
 
 if __name__ == "__main__":
-    main()
+    Command(__doc__).run(lambda _: print_page(lines(), RESULTS / "nordland-http.md"))

@@ -6,13 +6,13 @@ Map, landmarks and live drive as in `bench.nordland`; ten moves an episode, the 
 """
 
 import io
-import tempfile
-from pathlib import Path
+from collections.abc import Iterator
 
 from rich.console import Console
 
-from bench.measurement import machine, real_recordings, write_page
+from bench.measurement import RESULTS, Command, machine, print_page, work_folder
 from bench.nordland import DOMAIN, REMAP, drive_folders, make_domain
+from bench.recordings import real_recordings
 from deepsimbad_client import Client
 from deepsimbad_client.http.admin import remap
 from deepsimbad_client.http.local_server import LocalServer
@@ -24,11 +24,11 @@ PLANNERS = ("default", "random", "constant:10", "constant:8", "constant:5", "nnq
 EPISODES = 150
 
 
-def main() -> None:
-    """Measure, print, write `docs/results/nordland-active.md`."""
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
-        drives, *_ = drive_folders(real_recordings() / "nordland", work)
+def lines() -> Iterator[str]:
+    """Measure; the lines of the page."""
+    nordland = real_recordings() / "nordland"
+    with work_folder() as work:
+        drives, *_ = drive_folders(nordland, work)
         with LocalServer(work / "data") as server, Client(server.url) as client:
             make_domain(client, drives)
             remap(client, DOMAIN, "map", **REMAP)
@@ -38,7 +38,7 @@ def main() -> None:
     console = Console(width=150, record=True, file=io.StringIO())
     for table in active_tables(summary):
         console.print(table)
-    lines = [
+    yield from (
         "# Active episodes on Nordland images, through HTTP",
         "",
         f"Made by `python -m bench.nordland_active`: {EPISODES} episodes of ten moves, the same starts for all.",
@@ -52,9 +52,8 @@ def main() -> None:
         "```",
         console.export_text().rstrip(),
         "```",
-    ]
-    write_page("nordland-active.md", lines)
+    )
 
 
 if __name__ == "__main__":
-    main()
+    Command(__doc__).run(lambda _: print_page(lines(), RESULTS / "nordland-active.md"))

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import ACTIONS_M, machine, markdown, real_recordings, write_page
+from bench.measurement import ACTIONS_M, RESULTS, Command, machine, markdown, print_page
+from bench.recordings import evaluator_of, real_recordings
 from deepsimbad.core.building import MapPlan, compose_map
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
@@ -25,7 +26,6 @@ from deepsimbad.core.relevance import DEFAULT_RELEVANCE
 from deepsimbad.engine.localizer import NothingSeen, describe
 from deepsimbad.evaluators.base import Evaluator, Image
 from deepsimbad.evaluators.image import is_blank
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 
 EXTRACTORS = ("efficientnet_lite0", "gradient_grid")
 GRAINS_PX = (0, 1, 2, 4, 8, 16)  # standard deviations of the blur
@@ -100,7 +100,7 @@ def lines() -> Iterator[str]:
         "its second half": (*corridor, slice(56, 111)),
     }
     for extractor in EXTRACTORS:
-        evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": extractor}))
+        evaluator = evaluator_of(extractor)
         rows: dict[str, list[str]] = {}
         for map_folder, live_folder, numbers in drives.values():
             encodings = _encoded(evaluator, _images(map_folder, numbers))
@@ -119,4 +119,4 @@ def lines() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    write_page("nothing.md", lines())
+    Command(__doc__).run(lambda _: print_page(lines(), RESULTS / "nothing.md"))

@@ -11,34 +11,30 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
-from pathlib import Path
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import machine, markdown, real_recordings, write_page
+from bench.measurement import RESULTS, Command, machine, markdown, print_page, scored
 from bench.nordland import LANDMARK_FRAMES, MAP_FRAMES, kept_frames
+from bench.recordings import encoded, netvlad_drives, real_recordings
 from deepsimbad.core.building import MapPlan
 from deepsimbad.core.drive import Drive
 from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.metrics import RetrievalScorer
 from deepsimbad.core.on_board import pack_ranked_landmarks, pack_unit_encoding, ranked_landmarks_within
 from deepsimbad.core.relevance import Relevance
+from deepsimbad.core.route import true_images_of
 from deepsimbad.engine.localizer import PackedRanks, PackedUnitEncoding, describe
-from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.feature_l2 import FeatureL2
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
 from deepsimbad.evaluators.space import unit_vectors
 from deepsimbad.jobs.build import build, measure_drive, views_of
+from deepsimbad.jobs.experiments.vpr import moves_between
 
 N_LANDMARKS, N_SENT = (128, 256, 300, 500), (8, 16, 32, 48, 64)  # and as many as the budget holds
 N_BITS = (3, 4, 5, 8)  # a number of a unit encoding
 LIST_LENGTH, TOLERANCE, BUDGET_BYTES = 4, 2, 64
-_DRIVES = ("nr", "nq", "nq2")
-_IMAGES_A_BLOCK = 16
 _EVALUATOR = FeatureL2("none")
 
 Packed: TypeAlias = PackedRanks | PackedUnitEncoding
@@ -46,85 +42,52 @@ Packed: TypeAlias = PackedRanks | PackedUnitEncoding
 
 @dataclass(frozen=True)
 class Drives:
-    """A landmark, a training and a test drive, encoded.
+    """A landmark, a training and a test drive, and whether the first drove the route of the others."""
 
-    Attributes:
-        landmarks, training, test: [n, d] float32 each.
-        position: [n] of the training and of the test frames, one a place.
-        is_of_two_seasons: Whether the landmark drive shares the places of the training drive, row by row.
-    """
-
-    landmarks: NDArray[np.float32]
-    training: NDArray[np.float32]
-    test: NDArray[np.float32]
-    position: NDArray[np.int64]
+    landmarks: Drive
+    training: Drive
+    test: Drive
     is_of_two_seasons: bool
 
     def map(self, relevance: Relevance, n_landmarks: int) -> Map:
         """The map of the training drive."""
-        landmarks, training = (
-            Drive(position_m=np.arange(float(len(rows))), encodings=rows) for rows in (self.landmarks, self.training)
-        )
-        second = landmarks if self.is_of_two_seasons else None
+        second = self.landmarks if self.is_of_two_seasons else None
         plan = MapPlan(relevance, LIST_LENGTH, (1.0,), same_route=True)
-        return build(plan, training, second, landmarks, n_landmarks, _EVALUATOR).map
+        return build(plan, self.training, second, self.landmarks, n_landmarks, _EVALUATOR).map
 
 
-def ranked(drives: Drives, map_: Map, m: int) -> list[PackedRanks]:
+def ranks_of(test: Drive, map_: Map, m: int) -> list[PackedRanks]:
     """Bodies that a robot sends of the test frames, each its m nearest landmarks."""
-    test = Drive(position_m=np.arange(float(len(drives.test))), encodings=drives.test)
     ranks = views_of(measure_drive(test, map_.landmark_model, _EVALUATOR)).ranks
     return [PackedRanks(pack_ranked_landmarks(np.argsort(row)[:m].tolist(), map_.n_landmarks)) for row in ranks]
 
 
-def encoded(drives: Drives, map_: Map, n_bits: int) -> list[PackedUnitEncoding]:
+def units_of(test: Drive, map_: Map, n_bits: int) -> list[PackedUnitEncoding]:
     """Bodies that a robot sends of the test frames, each its unit encoding at some bits a number."""
-    return [PackedUnitEncoding(pack_unit_encoding(u, n_bits)) for u in unit_vectors(drives.test, map_.landmark_model)]
+    units = unit_vectors(test.encodings, map_.landmark_model)
+    return [PackedUnitEncoding(pack_unit_encoding(u, n_bits)) for u in units]
 
 
-def anr(drives: Drives, map_: Map, views: Iterable[Packed], statistics: str) -> float:
-    """ANR in percent over the test drive.
+def anr(test: Drive, map_: Map, views: Iterable[Packed], *, in_session: bool) -> float:
+    """ANR in percent over the test drive, of what was sent of every frame in one session, or of each view alone."""
 
-    Args:
-        drives: Where the test frames were taken.
-        built: The map.
-        views: What was sent of every test frame.
-        how: `session`: with the live statistics of a drive in order; `alone`: every view by the map's.
-    """
-    scorer, live = RetrievalScorer(), map_.live_statistics
-    for frame, view in enumerate(views):
-        query = describe(map_, _EVALUATOR, view)
-        live = live.observing(query) if live is not None and statistics == "session" else live
-        truths = np.flatnonzero(np.abs(drives.position - drives.position[frame]) <= TOLERANCE)
-        scorer.add(relevances(map_, query, live), truths)
-    return scorer.result().anr
+    def rows() -> Iterator[NDArray[np.float32]]:
+        live = map_.live_statistics if in_session else None
+        for view, moved_m in zip(views, moves_between(test), strict=True):
+            query = describe(map_, _EVALUATOR, view)
+            live, _ = map_.after_view(live, query, moved_m)
+            yield relevances(map_, query, live)
+
+    return scored(rows(), true_images_of(test.route(), map_.route, TOLERANCE)).anr
 
 
-def netvlad(folder: Path) -> list[Drives]:
-    """The six landmark-training-test permutations of three drives."""
-    encodings = {name: np.load(folder / f"{name}.npy").astype(np.float32) for name in _DRIVES}
-    return [
-        Drives(encodings[landmarks], encodings[training], encodings[test], np.arange(len(encodings[test])), True)
-        for landmarks, training, test in itertools.permutations(_DRIVES)
-    ]
-
-
-def nordland(folder: Path) -> list[Drives]:
+def nordland() -> Drives:
     """Landmarks from summer frames 1000..1999, the map from summer 0..999, live images from winter 0..999."""
-    summer, winter = folder / "summer", folder / "winter"
-    map_frames, landmark_frames = kept_frames((summer, winter), MAP_FRAMES), kept_frames((summer,), LANDMARK_FRAMES)
-    evaluator = make_evaluator(evaluator_config({"kind": "feature_l2", "extractor": "efficientnet_lite0"}))
-    landmarks, training, test = (
-        _encoded(evaluator, season, numbers)
-        for season, numbers in ((summer, landmark_frames), (summer, map_frames), (winter, map_frames))
-    )
-    return [Drives(landmarks, training, test, np.array(map_frames), False)]
-
-
-def _encoded(evaluator: Evaluator, season: Path, numbers: Sequence[int]) -> NDArray[np.float32]:
-    images = [np.asarray(cv2.imread(str(season / f"{number:05}.png")), np.uint8) for number in numbers]
-    blocks = (images[first : first + _IMAGES_A_BLOCK] for first in range(0, len(images), _IMAGES_A_BLOCK))
-    return np.concatenate([evaluator.encode(block) for block in blocks])
+    folders = [real_recordings() / "nordland" / season for season in ("summer", "winter")]
+    summer, winter = (encoded(f"{folder}#0:2000") for folder in folders)
+    map_frames = np.array(kept_frames(tuple(folders), MAP_FRAMES))
+    landmark_frames = np.array(kept_frames((folders[0],), LANDMARK_FRAMES))
+    return Drives(summer.at(landmark_frames), summer.at(map_frames), winter.at(map_frames), is_of_two_seasons=False)
 
 
 def table(triplets: Sequence[Drives]) -> Iterator[str]:
@@ -134,29 +97,31 @@ def table(triplets: Sequence[Drives]) -> Iterator[str]:
 
 
 def _rows(triplets: Sequence[Drives], n_landmarks: int) -> Iterator[list[str]]:
-    composed = [(drives, drives.map(Relevance.COMPOSED, n_landmarks)) for drives in triplets]
-    rrf = [(drives, drives.map(Relevance.RRF, n_landmarks)) for drives in triplets]
-    columns = [(composed, "session"), (composed, "alone"), (rrf, "session")]
+    composed, rrf = (
+        [(drives.test, drives.map(relevance, n_landmarks)) for drives in triplets]
+        for relevance in (Relevance.COMPOSED, Relevance.RRF)
+    )
+    columns = [(composed, True), (composed, False), (rrf, True)]
     all_ranks: list[float] = []
     for m in (n_landmarks, *N_SENT, ranked_landmarks_within(BUDGET_BYTES, n_landmarks)):
-        n_bytes, means = _measured(columns, partial(ranked, m=m))
+        n_bytes, means = _measured(columns, partial(ranks_of, m=m))
         costs = [f"{mean:.2f}{_cost(mean, best)}" for mean, best in zip_longest(means, all_ranks)]
         all_ranks = all_ranks or means
         yield [str(n_landmarks), "all ranks" if m == n_landmarks else f"{m} ranks", n_bytes, *costs]
     for n_bits in N_BITS:
-        n_bytes, means = _measured(columns[:2], partial(encoded, n_bits=n_bits))
+        n_bytes, means = _measured(columns[:2], partial(units_of, n_bits=n_bits))
         costs = [f"{mean:.2f}{_cost(mean, best)}" for mean, best in zip(means, all_ranks, strict=False)]
         yield [str(n_landmarks), f"u, {n_bits} bits a number", n_bytes, *costs, ""]
 
 
 def _measured(
-    columns: Sequence[tuple[Sequence[tuple[Drives, Map]], str]], pack: Callable[[Drives, Map], Sequence[Packed]]
+    columns: Sequence[tuple[Sequence[tuple[Drive, Map]], bool]], pack: Callable[[Drive, Map], Sequence[Packed]]
 ) -> tuple[str, list[float]]:
     """The bytes of a body, bold where the budget holds it, and the ANR of every column."""
     n_bytes = len(pack(*columns[0][0][0])[0].body)
     means = [
-        float(np.mean([anr(drives, map_, pack(drives, map_), statistics) for drives, map_ in maps]))
-        for maps, statistics in columns
+        float(np.mean([anr(test, map_, pack(test, map_), in_session=in_session) for test, map_ in maps]))
+        for maps, in_session in columns
     ]
     return f"**{n_bytes}**" if n_bytes <= BUDGET_BYTES else str(n_bytes), means
 
@@ -166,8 +131,9 @@ def _cost(mean: float, best: float | None) -> str:
     return "" if best is None else f" ({100 * (mean / best - 1):+.0f} %)"
 
 
-def report(recordings: Path) -> Iterator[str]:
+def report() -> Iterator[str]:
     """The lines of the page."""
+    drives = netvlad_drives()
     yield from ("# Encoding on board: what an observation of a few bytes costs", "")
     yield (
         "A robot that encodes on board sends its unit encoding u as `application/vnd.deepsimbad.unit-encoding`, a few "
@@ -188,7 +154,7 @@ def report(recordings: Path) -> Iterator[str]:
     yield from ("", "Made by `python -m bench.onboard`.", "", machine(), "", "## NetVLAD encodings of Nordland", "")
     yield "Mean over the six landmark-training-test permutations of three drives, 600 places, 64 numbers each."
     yield ""
-    yield from table(netvlad(recordings / "nordland_netvlad64"))
+    yield from table([Drives(*order, is_of_two_seasons=True) for order in itertools.permutations(drives)])
     yield ""
     yield from ("## Images of Nordland, winter on a summer map", "")
     yield (
@@ -196,8 +162,8 @@ def report(recordings: Path) -> Iterator[str]:
         "season is known. Frames that show nothing are left out, as in [nordland-http.md](nordland-http.md)."
     )
     yield ""
-    yield from table(nordland(recordings / "nordland"))
+    yield from table([nordland()])
 
 
 if __name__ == "__main__":
-    write_page("onboard.md", report(real_recordings()))
+    Command(__doc__).run(lambda _: print_page(report(), RESULTS / "onboard.md"))

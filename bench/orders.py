@@ -6,18 +6,18 @@ Options go to `deepsimbad experiment`; MAP in one stands for the drive that is m
 the folder, so that a run goes on where it ended.
 """
 
-import argparse
 import itertools
 import json
 import subprocess
 import sys
+from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.measurement import machine, markdown
+from bench.measurement import Command, machine, markdown, print_page
 
 Documents = Mapping[str, dict[str, Any]]  # by landmarks-map-test
 READY = ("--evaluator", "feature_l2:none")  # of files of encodings
@@ -136,15 +136,20 @@ def calibration_lines(documents: Documents) -> Iterator[str]:
     yield from markdown(["", "mean", *documents], rows)
 
 
+TABLES = {"vpr": vpr_lines, "nbv": nbv_lines, "calibration": calibration_lines}
+
+
+def lines(arguments: Namespace, options: list[str]) -> Iterator[str]:
+    """The tables of a part, of experiments with these options."""
+    yield from (machine(), "")
+    yield from TABLES[arguments.part](measured(arguments.part, arguments.drives, arguments.keep, options))
+
+
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    lines = {"vpr": vpr_lines, "nbv": nbv_lines, "calibration": calibration_lines}
-    parser.add_argument("part", choices=lines)
-    parser.add_argument("drives", nargs=3)
-    parser.add_argument("--keep", type=Path, required=True, metavar="FOLDER")
-    own_options, _, passed_on = " ".join(sys.argv[1:]).partition(" -- ")
-    arguments = parser.parse_args(own_options.split())
-    print(machine())
-    print()
-    for line in lines[arguments.part](measured(arguments.part, arguments.drives, arguments.keep, passed_on.split())):
-        print(line)
+    command = Command(__doc__)
+    command.add_argument("part", choices=TABLES)
+    command.add_argument("drives", nargs=3, metavar="DRIVE")
+    command.add_argument("--keep", type=Path, required=True, metavar="FOLDER")
+    words = [*sys.argv[1:], "--"]
+    own_words, passed_on = words[: words.index("--")], words[words.index("--") + 1 : -1]
+    command.run(lambda arguments: print_page(lines(arguments, passed_on)), own_words)

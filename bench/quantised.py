@@ -6,17 +6,19 @@ Codebooks are learnt on the map's own places, which is the best they can be. A v
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import machine, markdown, real_recordings, write_page
+from bench.measurement import RESULTS, Command, figures, machine, markdown, print_page, scored
+from bench.recordings import netvlad_drives
+from deepsimbad.core import composed
 from deepsimbad.core.building import Built, MapPlan, compose_map
-from deepsimbad.core.composed import list_weights, unit
+from deepsimbad.core.composed import unit
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
+from deepsimbad.core.metrics import RetrievalScores
 from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import true_images_of
 from deepsimbad.evaluators.feature_l2 import FeatureL2
@@ -24,7 +26,6 @@ from deepsimbad.jobs.build import measure_drive, views_of
 from deepsimbad.jobs.experiments.vpr import moves_between, relevances_by_all
 
 _ROUNDS = 25  # of k-means
-DRIVES = ("nr", "nq", "nq2")
 LIST_LENGTH, TOLERANCE = 4, 2
 N_LANDMARKS = (300, 512)
 SEASONS = {"two seasons (f)": True, "one season (u)": False}
@@ -66,35 +67,33 @@ def residual_quantised(rows: NDArray[np.float32], parts: int, k: int) -> NDArray
 
 def composed_places(lists: NDArray[np.uint16], landmarks: NDArray[np.float32]) -> NDArray[np.float32]:
     """[n, k] what lists [h, n] restore: the direction of the weighted sum of their landmarks [r, k]."""
-    weights = list_weights(len(lists))
-    return unit(sum(weight * landmarks[ids] for weight, ids in zip(weights, lists, strict=True)))
+    return unit(np.tensordot(composed.list_weights(len(lists)), landmarks[lists], axes=1))
 
 
-def netvlad_drives() -> dict[str, Drive]:
-    """The three drives of `nordland_netvlad64`, a place a metre."""
-    folder = real_recordings() / "nordland_netvlad64"
-    rows = {name: np.load(folder / f"{name}.npy").astype(np.float32) for name in DRIVES}
-    return {
-        name: Drive(position_m=np.arange(float(len(encodings))), encodings=encodings)
-        for name, encodings in rows.items()
-    }
+def restorations(builds: Sequence[Built]) -> Iterator[tuple[str, str, int, NDArray[np.float32]]]:
+    """Name, bits and numbers of every description of the places of a map, and what it restores of them.
+
+    Args:
+        builds: The map with few landmarks and with more; its places are the same.
+    """
+    places = builds[-1].places
+    d = places.shape[1]
+    for built_map in builds:
+        prototypes = built_map.map.landmark_model["prototypes"]
+        r, bits = len(prototypes), f"{LIST_LENGTH * np.log2(len(prototypes)):.0f}"
+        yield "composed", bits, r * d, composed_places(built_map.map.lists, prototypes)
+        yield "product quantisation, 4 parts", bits, r * d, product_quantised(places, 4, r)
+        yield "residual quantisation, 4 parts", bits, 4 * r * d, residual_quantised(places, 4, r)
+    yield "product quantisation, 6 parts", "36", 64 * d, product_quantised(places, 6, 64)
+    yield "residual quantisation, 6 parts", "36", 6 * 64 * d, residual_quantised(places, 6, 64)
+    yield "nothing left out", f"{32 * d:,}", 0, places
 
 
-def scored(built_map: Built, places: NDArray[np.float32], test: Drive) -> RetrievalScores:
+def session_scores(built_map: Built, places: NDArray[np.float32], test: Drive) -> RetrievalScores:
     """Scores of one session over the test drive against restored places [n, k]."""
-    truth = true_images_of(test.route(), built_map.map.route, TOLERANCE)
     views = views_of(measure_drive(test, built_map.map.landmark_model, FeatureL2("none")))
     rows = relevances_by_all(replace(built_map, places=places), views, moves_between(test), stateless=False)
-    scorer = RetrievalScorer()
-    for row, true_images in zip(rows, truth, strict=True):
-        scorer.add(row, true_images)
-    return scorer.result()
-
-
-def row_of(scores: list[RetrievalScores]) -> list[str]:
-    """Mean ANR and R@1, and the worst ANR, in percent."""
-    anr = [score.anr for score in scores]
-    return [f"{np.mean(anr):.2f}", f"{np.mean([score.recall_at[1] for score in scores]):.1f}", f"{max(anr):.2f}"]
+    return scored(rows, true_images_of(test.route(), built_map.map.route, TOLERANCE))
 
 
 def report() -> Iterator[str]:
@@ -113,38 +112,15 @@ def report() -> Iterator[str]:
     for title, has_two in SEASONS.items():
         yield from ("", f"## {title}", "")
         scores: dict[tuple[str, str, str], list[RetrievalScores]] = {}
-        for landmarks, training, test in itertools.permutations(drives.values()):
+        for landmarks, training, test in itertools.permutations(drives):
             second = landmarks if has_two else None
             plan = MapPlan(Relevance.COMPOSED, LIST_LENGTH, (1.0,), same_route=True)
-            for r in N_LANDMARKS:
-                built_map = compose_map(plan, training, second, second, r)
-                places, d = built_map.places, built_map.places.shape[1]
-                bits = f"{4 * np.log2(r):.0f}"
-                for name, numbers, restored in (
-                    (
-                        "composed",
-                        r * d,
-                        composed_places(built_map.map.lists, built_map.map.landmark_model["prototypes"]),
-                    ),
-                    ("product quantisation, 4 parts", r * d, product_quantised(places, 4, r)),
-                    ("residual quantisation, 4 parts", 4 * r * d, residual_quantised(places, 4, r)),
-                ):
-                    scores.setdefault((name, bits, f"{numbers:,}"), []).append(scored(built_map, restored, test))
-            for name, numbers, restored in (
-                ("product quantisation, 6 parts", 64 * d, product_quantised(places, 6, 64)),
-                ("residual quantisation, 6 parts", 6 * 64 * d, residual_quantised(places, 6, 64)),
-                ("nothing left out", 0, places),
-            ):
-                bits = "36" if numbers else f"{32 * d:,}"
-                scores.setdefault((name, bits, f"{numbers:,}"), []).append(scored(built_map, restored, test))
-        rows = [(*description, *row_of(rows_scores)) for description, rows_scores in scores.items()]
+            builds = [compose_map(plan, training, second, second, r) for r in N_LANDMARKS]
+            for name, bits, n_numbers, restored in restorations(builds):
+                scores.setdefault((name, bits, f"{n_numbers:,}"), []).append(session_scores(builds[-1], restored, test))
+        rows = [(*description, *figures(rows_scores)) for description, rows_scores in scores.items()]
         yield from markdown(("description", "bits", "numbers", "ANR %", "R@1 %", "worst ANR %"), rows)
 
 
-def main() -> None:
-    """Measure, print, write `docs/results/quantised.md`."""
-    write_page("quantised.md", report())
-
-
 if __name__ == "__main__":
-    main()
+    Command(__doc__).run(lambda _: print_page(report(), RESULTS / "quantised.md"))

@@ -3,20 +3,18 @@
 `python -m bench.remap` prints this table alone, and ends with 1 where a limit is not kept.
 """
 
-import argparse
 import json
 import sys
-import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from bench.link import Link
-from bench.measurement import Limit, breaches, limit_table, markdown
+from bench.measurement import Command, Limit, breaches, limit_table, markdown, print_page, work_folder
 from bench.robots import LiveRobot, Waits, drive, jpegs
 from bench.worlds import ENCODING_DIM, N_CANDIDATES, N_LANDMARKS, NCLT_IMAGES, SPACING_M, write_seasons
 from deepsimbad_client import Client
@@ -87,13 +85,13 @@ class RemapFigures:
 
 def measured(size: RemapSize) -> RemapFigures:
     """Measure on a service of its own."""
-    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
+    with work_folder() as folder, LocalServer(folder / "data") as server:
         with Client(server.url) as client:
             client.admin.put_domain(_DOMAIN, {"kind": "feature_l2", "extractor": "none"})
             client.admin.put_domain(_CAMERA_DOMAIN, {"kind": "feature_l2"})
             encoding_dim = client.domain(_CAMERA_DOMAIN).encoding_dim
-        write_seasons(Path(folder) / "data", _DOMAIN, size.n_frames, size.n_candidates, ENCODING_DIM)
-        write_seasons(Path(folder) / "data", _CAMERA_DOMAIN, size.n_frames, N_LANDMARKS, encoding_dim)
+        write_seasons(folder / "data", _DOMAIN, size.n_frames, size.n_candidates, ENCODING_DIM)
+        write_seasons(folder / "data", _CAMERA_DOMAIN, size.n_frames, N_LANDMARKS, encoding_dim)
         _remapped(server.url, _CAMERA_DOMAIN, episodes=0)
         alone = _remapped(server.url, _DOMAIN, size.episodes)
         robots = _robots(size)
@@ -165,19 +163,17 @@ def remap_table() -> Iterator[str]:
     yield from report(measured(RemapSize()))
 
 
-def main() -> None:
+def measure(arguments: Namespace) -> None:
     """Print the table; ends with 1 where a limit is not kept."""
-    default = RemapSize()
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=default.n_frames)
-    parser.add_argument("--candidates", type=int, default=default.n_candidates)
-    parser.add_argument("--episodes", type=int, default=default.episodes)
-    parser.add_argument("--idle", type=float, default=default.idle_s, metavar="SECONDS")
-    arguments = parser.parse_args()
-    figures = measured(RemapSize(arguments.frames, arguments.candidates, arguments.episodes, arguments.idle))
-    print("\n".join(report(figures)), flush=True)
+    figures = measured(RemapSize(**vars(arguments)))
+    print_page(report(figures))
     sys.exit(breaches(figures.limits()))
 
 
 if __name__ == "__main__":
-    main()
+    default, command = RemapSize(), Command(__doc__)
+    command.add_argument("--frames", type=int, default=default.n_frames, dest="n_frames")
+    command.add_argument("--candidates", type=int, default=default.n_candidates, dest="n_candidates")
+    command.add_argument("--episodes", type=int, default=default.episodes)
+    command.add_argument("--idle", type=float, default=default.idle_s, dest="idle_s", metavar="SECONDS")
+    command.run(measure)

@@ -9,42 +9,45 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
+from argparse import SUPPRESS
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
 import httpx2
 import numpy as np
 
+from bench.measurement import PROJECT, Command, work_folder
+
 N_IMAGES, N_LANDMARKS, N_WARM, N_MEASURED, N_TURNS = 2000, 300, 100, 600, 4
 DOMAIN = "/v1/admin/domains/d"
 
 
-def main() -> None:
+def compare(checkouts: Sequence[Path]) -> None:
     """Print the median of every turn."""
-    project = Path(__file__).resolve().parents[1]
     for turn in range(N_TURNS):
-        for checkout in [*map(Path, sys.argv[1:]), project]:
-            folders = (checkout.resolve() / name for name in ("service", "client", "migrations"))
+        for checkout in [*checkouts, PROJECT]:
+            folders = [checkout.resolve(strict=True) / name for name in ("service", "client", "migrations")]
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
-            command = [sys.executable, __file__, "--measure"]
-            process = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - itself
+            command = [sys.executable, "-m", "bench.request", "--measure"]
+            process = subprocess.run(command, cwd=PROJECT, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - itself
             print(f"turn {turn + 1}, {checkout}: {float(process.stdout):.2f} ms")
 
 
 def measure() -> None:
     """Print milliseconds of an observation, of the packages that are on the path."""
-    print(1000 * median(asyncio.run(_seconds())[N_WARM:]))
+    with work_folder() as folder:
+        print(1000 * median(asyncio.run(_seconds(folder))[N_WARM:]))
 
 
-async def _seconds() -> list[float]:
+async def _seconds(data_dir: Path) -> list[float]:
     from deepsimbad.api.app import create_app  # noqa: PLC0415 - of the checkout that is on the path
     from deepsimbad.settings import Settings  # noqa: PLC0415
 
     rng = np.random.default_rng(0)
     encodings = np.cumsum(rng.normal(size=(N_IMAGES, 32)), axis=0).astype(np.float32)
-    app = create_app(Settings(data_dir=Path(tempfile.mkdtemp())))
+    app = create_app(Settings(data_dir=data_dir))
     transport = httpx2.ASGITransport(app, client=("127.0.0.1", 1))
     async with (
         app.router.lifespan_context(app),
@@ -80,4 +83,7 @@ async def _seconds() -> list[float]:
 
 
 if __name__ == "__main__":
-    measure() if "--measure" in sys.argv else main()
+    command = Command(__doc__)
+    command.add_argument("checkouts", type=Path, nargs="*", metavar="CHECKOUT")
+    command.add_argument("--measure", action="store_true", help=SUPPRESS)
+    command.run(lambda arguments: measure() if arguments.measure else compare(arguments.checkouts))

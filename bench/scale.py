@@ -16,10 +16,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bench.measurement import markdown, write_page
+from bench.measurement import RESULTS, Command, markdown, print_page
 from deepsimbad.fleet.placement import owners
-
-MEBIBYTE = 2**20
+from deepsimbad.settings import MEBIBYTE
 
 
 @dataclass(frozen=True)
@@ -173,4 +172,4 @@ def row(name: str, outcome: Outcome) -> tuple[str, ...]:
 
 
 if __name__ == "__main__":
-    write_page("scale.md", lines())
+    Command(__doc__).run(lambda _: print_page(lines(), RESULTS / "scale.md"))

@@ -10,57 +10,56 @@ SECOND, two drives of another route.
 
 import itertools
 import sys
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from bench.measurement import ACTIONS_M, machine, markdown
+from bench.measurement import ACTIONS_M, Command, figures, machine, markdown, print_page, scored
+from bench.recordings import encoded
 from deepsimbad.core.building import MapPlan, SeenTwice, compose_map
 from deepsimbad.core.drive import Drive
-from deepsimbad.core.index.retrieval import relevances
 from deepsimbad.core.map import Map
-from deepsimbad.core.metrics import RetrievalScorer, RetrievalScores
-from deepsimbad.core.relevance import Query, Relevance
+from deepsimbad.core.metrics import RetrievalScores
+from deepsimbad.core.relevance import Relevance
 from deepsimbad.core.route import same_places, true_images_of
-from deepsimbad.evaluators.registry import evaluator_config, make_evaluator
+from deepsimbad.evaluators.feature_l2 import FeatureL2
 from deepsimbad.jobs.append import KnownDrives, fuse
-from deepsimbad.jobs.build import encode_recording
-from deepsimbad_client.recordings.sources import open_source
+from deepsimbad.jobs.build import measure_drive, views_of
+from deepsimbad.jobs.experiments.vpr import moves_between, relevances_in_order
 
 PLAN = MapPlan(Relevance.COMPOSED, 4, ACTIONS_M, same_route=True)
 MOST_LANDMARKS = 300
-MAX_PIXELS = 50_000_000
 TOLERANCE_M = 2.0
 ONE, BY_CAMERA, FROM_THE_START = "one season", "one, and the camera's", "two from the start"
 APPENDED = ("one, and one appended", "one, and two appended", "one, and three appended")
 KINDS = (ONE, APPENDED[0], FROM_THE_START, *APPENDED[1:], BY_CAMERA)
 
 
-def lines(sources: Sequence[str]) -> Iterator[str]:
+def lines(sources: Sequence[str], camera: Sequence[str]) -> Iterator[str]:
     """The table."""
-    yield from (machine(), "", f"`python -m bench.seasons {' '.join(sources)}`", "")
+    yield from (machine(), "", f"`python -m bench.seasons {' '.join(sys.argv[1:])}`", "")
     scores: dict[str, list[tuple[RetrievalScores, RetrievalScores]]] = {kind: [] for kind in KINDS}
-    for test, maps_by_kind in worlds(sources):
+    for test, maps_by_kind in worlds([encoded(source) for source in sources], [encoded(source) for source in camera]):
         for kind, map_ in maps_by_kind:
             scores[kind].append((scores_of(map_, test, stateless=False), scores_of(map_, test, stateless=True)))
     yield from markdown(
         ("map of", "orders", "one session: ANR / R@1 / worst ANR", "every view on its own"),
-        ((kind, len(rows), *map(figures, zip(*rows, strict=True))) for kind, rows in scores.items() if rows),
+        (
+            (kind, len(rows), *(" / ".join(figures(column)) for column in zip(*rows, strict=True)))
+            for kind, rows in scores.items()
+            if rows
+        ),
     )
 
 
-def worlds(sources: Sequence[str]) -> Iterator[tuple[Drive, Iterator[tuple[str, Map]]]]:
+def worlds(drives: Sequence[Drive], camera: Sequence[Drive]) -> Iterator[tuple[Drive, Iterator[tuple[str, Map]]]]:
     """Every test drive, and the maps that it is driven on."""
-    if sources[0] != "--camera":
-        drives = encoded(sources)
-        for training, test in itertools.permutations(drives, 2):
-            yield test, maps(training, [drive for drive in drives if drive not in (training, test)])
-        return
-    first, second, *drives = encoded(sources[1:])
-    camera = (SeenTwice(first, second, same_places(second.route(), first.route())),)
+    seen_twice = [SeenTwice(camera[0], camera[1], same_places(camera[1].route(), camera[0].route()))] if camera else []
     for training, test in itertools.permutations(drives, 2):
-        yield test, by_camera(training, camera)
+        if seen_twice:
+            yield test, by_camera(training, seen_twice)
+        else:
+            yield test, maps(training, [drive for drive in drives if drive not in (training, test)])
 
 
 def by_camera(training: Drive, camera: Sequence[SeenTwice]) -> Iterator[tuple[str, Map]]:
@@ -68,17 +67,6 @@ def by_camera(training: Drive, camera: Sequence[SeenTwice]) -> Iterator[tuple[st
     n_landmarks = min(MOST_LANDMARKS, training.n_frames)
     yield ONE, compose_map(PLAN, training, None, None, n_landmarks).map
     yield BY_CAMERA, compose_map(PLAN, training, None, None, n_landmarks, camera=camera).map
-
-
-def encoded(sources: Sequence[str]) -> list[Drive]:
-    """Every drive; images by the default extractor."""
-    drives = []
-    for source in sources:
-        recording = open_source(source)
-        config = {"kind": "feature_l2", **({} if recording.encodings is None else {"extractor": "none"})}
-        evaluator = make_evaluator(evaluator_config(config))
-        drives.append(encode_recording(recording, evaluator, MAX_PIXELS, lambda _: None).drive)
-    return drives
 
 
 def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]:
@@ -102,21 +90,21 @@ def maps(training: Drive, seasons: Sequence[Drive]) -> Iterator[tuple[str, Map]]
 
 def scores_of(map_: Map, test: Drive, *, stateless: bool) -> RetrievalScores:
     """Scores of one session over the drive, or of every view by itself."""
-    scorer, live = RetrievalScorer(), map_.live_statistics
-    truths = true_images_of(test.route(), map_.route, TOLERANCE_M)
-    for encoding, truth in zip(test.encodings, truths, strict=True):
-        view = Query(np.arange(1.0, map_.n_landmarks + 1, dtype=np.float32), encoding=encoding)
-        live = live if stateless or live is None else live.observing(view)
-        scorer.add(relevances(map_, view, live), truth)
-    return scorer.result()
+    views = views_of(measure_drive(test, map_.landmark_model, FeatureL2("none")))
+    live = None if stateless else map_.live_statistics
+    rows = relevances_in_order(map_, views, live, moves_between(test))
+    return scored(rows, true_images_of(test.route(), map_.route, TOLERANCE_M))
 
 
-def figures(scores: Sequence[RetrievalScores]) -> str:
-    """Mean ANR, mean R@1 and the worst ANR, in percent."""
-    anr = [score.anr for score in scores]
-    return f"{np.mean(anr):.2f} / {np.mean([score.recall_at[1] for score in scores]):.1f} / {max(anr):.2f}"
+def measure(arguments: Namespace) -> None:
+    """Print the table."""
+    if len(arguments.sources) < 2:
+        command.error("one drive is mapped and another driven: give two SOURCEs or more")
+    print_page(lines(arguments.sources, arguments.camera))
 
 
 if __name__ == "__main__":
-    for line in lines(sys.argv[1:]):
-        print(line, flush=True)
+    command = Command(__doc__)
+    command.add_argument("sources", nargs="+", metavar="SOURCE")
+    command.add_argument("--camera", nargs=2, default=(), metavar=("FIRST", "SECOND"))
+    command.run(measure)

@@ -1,16 +1,14 @@
 """Answers over loopback: stateless, durable sessions of one robot and of many, and a start after a kill."""
 
 import json
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 
 from bench.link import Link
-from bench.measurement import Timing, markdown, timed
+from bench.measurement import Timing, markdown, timed, work_folder
 from bench.robots import LiveRobot, drive
 from bench.worlds import N_LANDMARKS, NCLT_IMAGES
 from deepsimbad_client import Client
@@ -24,7 +22,7 @@ def mapped_service(**arrays: np.ndarray) -> Iterator[LocalServer]:
     """A service with a wandering drive mapped through its HTTP calls; `arrays` are further ones of its frames."""
     wander = np.cumsum(np.random.default_rng(0).normal(size=(NCLT_IMAGES, _DIM)), axis=0)
     encodings = (wander / np.linalg.norm(wander, axis=1, keepdims=True)).astype(np.float32)
-    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder) / "data") as server:
+    with work_folder() as folder, LocalServer(folder / "data") as server:
         with Link(server.url) as link:
             link.ask("PUT", "/v1/admin/domains/bench", {"evaluator": {"kind": "feature_l2", "extractor": "none"}})
             link.upload("bench", "landmarks", np.arange(len(encodings[::5])) * 0.2, encodings[::5])

@@ -1,15 +1,14 @@
 """`python -m bench.soak`, and `make soak`: the report of one soak."""
 
-import argparse
 import sys
-import tempfile
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.measurement import Limit, breaches, limit_table, machine, markdown
+from bench.measurement import Command, Limit, breaches, limit_table, machine, markdown, print_page, work_folder
 from bench.soak.trial import LONGEST_LIFE_S, Soak, soak
 
 READY_WITHIN_S = 2.0
@@ -66,27 +65,23 @@ def _spread(figures: NDArray[np.float64], unit: str) -> str:
     )
 
 
-def main() -> None:
+def measure(arguments: Namespace) -> None:
     """Run one soak and print its report; ends with 1 where a start took too long."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="write the report here as well")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
+    with work_folder() as folder:
         result = soak(
-            Path(folder) / "data",
+            folder / "data",
             arguments.kills,
             arguments.seed,
             lambda n_kills: print(f"\r{n_kills} of {arguments.kills} kills", end="", file=sys.stderr, flush=True),
         )
-    text = "\n".join(report(result)) + "\n"
     print(file=sys.stderr)
-    print(text, end="")
-    if arguments.out is not None:
-        arguments.out.write_text(text, encoding="utf-8")
+    print_page(report(result), arguments.out)
     sys.exit(breaches(limits(result)))
 
 
 if __name__ == "__main__":
-    main()
+    command = Command(__doc__)
+    command.add_argument("--kills", type=int, default=200)
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--out", type=Path, help="write the report here as well")
+    command.run(measure)

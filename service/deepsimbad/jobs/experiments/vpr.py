@@ -245,7 +245,7 @@ def score_maps(
         map_ = map_builds[name].map
         views, moved_m = test.by(map_.landmark_model), moves_between(test.drive)
         live = None if config.stateless else map_.live_statistics
-        keep(name.value, _relevances_in_order(map_, views, live, moved_m, progress.update))
+        keep(name.value, relevances_in_order(map_, views, live, moved_m, progress.update))
         if name.traits.compares_unit_vectors and bound:
             keep(BRUTE_FORCE_U, relevances_by_all(map_builds[name], views, moved_m, config.stateless))
     return scores
@@ -280,14 +280,20 @@ def moves_between(drive: Drive) -> list[float | None]:
     return [None, *np.diff(drive.position_m).tolist()]
 
 
-def _relevances_in_order(
+def relevances_in_order(
     map_: Map,
     views: Query,
     live: LiveStatistics | None,
     moved_m: Sequence[float | None],
-    on_progress: Callable[[float], None],
+    on_progress: Callable[[float], None] = lambda _: None,
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield the relevances [n] to every view in order."""
+    """Yield the relevances [n] to every view in order.
+
+    Args:
+        views: A batch.
+        live: The statistics that a session starts from; None: every view by itself.
+        moved_m: Metres moved to every view from the one before; None of the first.
+    """
     # Without a session's statistics every view is compared by itself; many at once are one matrix product.
     size = 1 if map_.relevance.traits.is_listed else _QUERIES_A_BLOCK
     for first in range(0, len(moved_m), size):
