@@ -42,8 +42,7 @@ _DIM = 64  # of encodings whose number is all that counts
 
 def landmark_table() -> Iterator[str]:
     """Markdown lines."""
-    yield "## Landmark selection"
-    yield ""
+    yield from ("## Landmark selection", "")
     spent = _in_own_process("landmarks")
     shape = [f"{N_CANDIDATES:,}", f"{ENCODING_DIM:,}", N_LANDMARKS]
     head = ("candidates", "dimensions", "landmarks", "seconds", "peak memory, candidates included")
@@ -101,8 +100,7 @@ def _with_model(map_: Map) -> Map:
 
 def composed_table() -> Iterator[str]:
     """Markdown lines."""
-    yield f"## Lists and the planner's table: {NCLT_IMAGES:,} map images, r = {N_LANDMARKS}, h = 4"
-    yield ""
+    yield from (f"## Lists and the planner's table: {NCLT_IMAGES:,} map images, r = {N_LANDMARKS}, h = 4", "")
     rng = np.random.default_rng(0)
     places, landmarks = (unit(rng.normal(size=(count, MOST_DIMENSIONS))) for count in (NCLT_IMAGES, N_LANDMARKS))
     listing = timed(lambda: compose(places, landmarks, 4), repeats=3, warm_up=1)

@@ -18,7 +18,7 @@ import torch
 
 from bench.link import Link
 from bench.measurement import RESULTS, Command, Timing, interleaved, machine, markdown, print_page, timed, work_folder
-from bench.robots import LiveRobot, Waits, drive
+from bench.robots import LiveRobot, Waits, drive, grainy_jpegs
 from deepsimbad.evaluators.base import Evaluator
 from deepsimbad.evaluators.compute import Compute, Runtime
 from deepsimbad.evaluators.extractors.base import resized
@@ -32,17 +32,6 @@ from deepsimbad_client.http.local_server import LocalServer
 RUNTIMES = (Runtime.TORCH, Runtime.TORCH_BF16, Runtime.ONNXRUNTIME)
 N_ROBOTS, N_VIEWS = 16, 60
 _DOMAIN = "street"
-
-
-def pictures(n: int) -> list[bytes]:
-    """JPEGs of 640 x 480, about 90 kB each: smooth shapes with the grain of a camera."""
-    rng = np.random.default_rng(0)
-    bodies = []
-    for _ in range(n):
-        coarse = cv2.resize(rng.integers(0, 256, (24, 32, 3), np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
-        grainy = np.clip(coarse + rng.normal(0, 6, coarse.shape), 0, 255).astype(np.uint8)
-        bodies.append(cv2.imencode(".jpg", grainy, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
-    return bodies
 
 
 def medians_ms(work: dict[str, Callable[[], object]], rounds: int = 60) -> dict[str, float]:
@@ -227,10 +216,9 @@ def starts() -> Iterator[str]:
 
 def report() -> Iterator[str]:
     """The lines of the page."""
-    bodies = pictures(24)
+    bodies = grainy_jpegs(24)
     yield from ("# Encoding", "", "Made by `python -m bench.encode`.", "", machine(), "")
-    yield f"The default extractor, `efficientnet_lite0`; JPEGs of {len(bodies[0]) // 1000} kB."
-    yield ""
+    yield from (f"The default extractor, `efficientnet_lite0`; JPEGs of {len(bodies[0]) // 1000} kB.", "")
     for part in (by_runtime(bodies), in_parts(bodies), batches(), robots(bodies), starts()):
         yield from part
 

@@ -16,6 +16,7 @@ import time
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
@@ -97,12 +98,20 @@ def digest(answer: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def replicas() -> list[int]:
-    """The processes of this machine that have domains."""
-    pids = []
+def fleet_of(data_dir: Path, store: Path, environment: dict[str, str], *options: str) -> LocalServer:
+    """A fleet that is not started yet, whose replicas share their maps in a folder."""
+    server = LocalServer(data_dir, data_dir.with_suffix(".log"), environment)
+    arguments = ("--data-dir", str(data_dir), "--map-store", f"file://{store}")
+    server.command[server.command.index("serve") :] = ["ray", "serve", *options, *arguments]
+    return server
+
+
+def processes_of(title: str) -> list[int]:
+    """The processes of this machine that serve a deployment whose name begins like this."""
+    command, pids = f"ray::ServeReplica:deepsimbad:{title}".encode(), []
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if b"ray::ServeReplica:deepsimbad:domains-" in (process / "cmdline").read_bytes():
+            if command in (process / "cmdline").read_bytes():
                 pids.append(int(process.name))
     return pids
 
@@ -117,21 +126,21 @@ def measured(url: str, arguments: Namespace, kill_every_s: float | None) -> Run:
             start_s = time.perf_counter()
             link.ask("POST", path, {"ranked_landmarks": list(range(N_LANDMARKS))})
             run.alone_s.append(time.perf_counter() - start_s)
-    robots = [
-        threading.Thread(target=drive, args=(url, run, number, arguments.domains, arguments.every_s, stopped))
-        for number in range(arguments.robots)
-    ]
+    with ThreadPoolExecutor(arguments.robots) as pool:
+        robots = [
+            pool.submit(drive, url, run, number, arguments.domains, arguments.every_s, stopped)
+            for number in range(arguments.robots)
+        ]
+        end_s = time.monotonic() + arguments.seconds
+        while (left_s := end_s - time.monotonic()) > 0:
+            time.sleep(min(left_s, kill_every_s or left_s))
+            is_early = kill_every_s is not None and end_s - time.monotonic() > kill_every_s / 2
+            if is_early and (pids := processes_of("domains-")):
+                os.kill(draws.choice(pids), signal.SIGKILL)
+                run.n_kills += 1
+        stopped.set()
     for robot in robots:
-        robot.start()
-    end_s = time.monotonic() + arguments.seconds
-    while (left_s := end_s - time.monotonic()) > 0:
-        time.sleep(min(left_s, kill_every_s or left_s))
-        if kill_every_s is not None and end_s - time.monotonic() > kill_every_s / 2 and (pids := replicas()):
-            os.kill(draws.choice(pids), signal.SIGKILL)
-            run.n_kills += 1
-    stopped.set()
-    for robot in robots:
-        robot.join()
+        robot.result()
     return run
 
 
@@ -182,20 +191,15 @@ def report(arguments: Namespace) -> Iterator[str]:
         shutil.copytree(folder / "plain", folder / "fleet")
         with LocalServer(folder / "plain", folder / "plain.log", settings) as server:
             plain = measured(server.url, arguments, None)
-        server = LocalServer(folder / "fleet", folder / "fleet.log", settings)
-        server.command[server.command.index("serve") :] = [
-            *("ray", "serve", "--replicas", str(arguments.replicas), "--data-dir", str(folder / "fleet")),
-            *("--map-store", f"file://{folder}/store"),
-        ]
-        with server:
+        options = ("--replicas", str(arguments.replicas))
+        with fleet_of(folder / "fleet", folder / "store", settings, *options) as server:
             start_s = time.perf_counter()
             switches = switched_s(server.url)
             calm_s = time.perf_counter() - start_s
             fleet = measured(server.url, arguments, arguments.kill_every_s)
     views = plain.digests.keys() & fleet.digests.keys()
     n_wrong = sum(plain.digests[view] != fleet.digests[view] for view in views)
-    yield "# A fleet whose replicas die"
-    yield ""
+    yield from ("# A fleet whose replicas die", "")
     yield (
         f"Made by `python -m bench.fleet`: {arguments.robots} robots observe every {arguments.every_s:g} s for "
         f"{arguments.seconds:g} s on {arguments.domains} domains of {arguments.images} map images and more, first of a "
@@ -203,10 +207,8 @@ def report(arguments: Namespace) -> Iterator[str]:
         f"at random (kill -9) every {arguments.kill_every_s:g} s. Maps and sessions are shared in a folder. The robots "
         "see the same both times, so every answer is compared."
     )
-    yield ""
-    yield machine()
-    yield f"Load average at the end: {', '.join(f'{load:.1f}' for load in os.getloadavg())}."
-    yield ""
+    yield from ("", machine())
+    yield from (f"Load average at the end: {', '.join(f'{load:.1f}' for load in os.getloadavg())}.", "")
     rows: list[tuple[str, Any, Any]] = [
         ("kills", "-", fleet.n_kills),
         ("observations acknowledged", len(plain.seconds), len(fleet.seconds)),
@@ -215,12 +217,8 @@ def report(arguments: Namespace) -> Iterator[str]:
         ("503 with Retry-After", plain.refusals.total(), f"{fleet.refusals.total()} {dict(fleet.refusals)}"),
     ]
     for name, share in (("median", 0.5), ("p99", 0.99), ("longest", 1.0)):
-        rows.append(
-            (
-                f"observation, {name}, repeats counted",
-                *(duration(quantile(run.seconds, share)) for run in (plain, fleet)),
-            )
-        )
+        spent = (duration(quantile(run.seconds, share)) for run in (plain, fleet))
+        rows.append((f"observation, {name}, repeats counted", *spent))
     alone = [quantile(run.alone_s, 0.5) for run in (plain, fleet)]
     rows.append(("observation of one robot alone, median", *map(duration, alone)))
     yield from markdown(("", "plain", "fleet"), rows)

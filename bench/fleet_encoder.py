@@ -5,13 +5,14 @@ Both run at once and are asked in turn: docs/results/fleet-encoder.md.
 
 import os
 import shutil
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from bench.fleet import fleet_of, processes_of
 from bench.link import Link
 from bench.measurement import (
     RESULTS,
@@ -24,54 +25,34 @@ from bench.measurement import (
     print_page,
     work_folder,
 )
+from bench.robots import grainy_jpegs
 from deepsimbad.settings import MEBIBYTE
 from deepsimbad_client.http.local_server import LocalServer
 
-N_IMAGES, N_REPLICAS, N_ROBOTS, N_EACH = 40, 2, 8, 12
+N_REPLICAS, N_ROBOTS, N_EACH = 2, 8, 12
 URL, JPEG = "/v1/domains/seen/localizations", {"Content-Type": "image/jpeg"}
 
 
-def picture(number: int) -> bytes:
-    """A JPEG of 640 x 480 pixels."""
-    coarse = np.random.default_rng(number).integers(0, 255, (12, 16, 3), np.uint8)
-    _, body = cv2.imencode(".jpg", cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC))
-    return np.asarray(body).tobytes()
-
-
-def make_domain(data_dir: Path) -> None:
+def make_domain(data_dir: Path, pictures: Sequence[bytes]) -> None:
     """A route of pictures, by the default network."""
     with LocalServer(data_dir) as server, Link(server.url) as link:
         link.ask("PUT", "/v1/admin/domains/seen", {"evaluator": {"kind": "feature_l2"}})
         link.ask("POST", "/v1/admin/domains/seen/traverses", {"name": "drive"})
-        for number in range(N_IMAGES):
+        for number, body in enumerate(pictures):
             path = f"/v1/admin/domains/seen/traverses/drive/frames/{number}?position_m={number}"
-            link.ask("PUT", path, picture(number), JPEG)
+            link.ask("PUT", path, body, JPEG)
         drives = {"training_traverse": "drive", "landmark_traverse": "drive"}
         link.remap("seen", {**drives, "n_landmarks": 20, "training_episodes": 0})
-
-
-def fleet_of(folder: Path, n_encoders: int, store: str) -> LocalServer:
-    """A fleet that is not started yet, and shares maps with the other one."""
-    data_dir = folder / f"encoders-{n_encoders}"
-    server = LocalServer(data_dir, folder / f"{data_dir.name}.log", {"DEEPSIMBAD_LOG_LEVEL": "WARNING"})
-    server.command[server.command.index("serve") :] = [
-        *("ray", "serve", "--replicas", str(N_REPLICAS), "--encoders", str(n_encoders)),
-        *("--data-dir", str(data_dir), "--map-store", store),
-    ]
-    return server
 
 
 def memory(parent: int, title: str) -> list[int]:
     """Bytes of a fleet's processes of a deployment, by its beginning; what processes share is counted in parts."""
     sizes = []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            is_of = f"ray::ServeReplica:deepsimbad:{title}".encode() in (process / "cmdline").read_bytes()
-            if is_of and parent in ancestors(int(process.name)):
-                lines = (process / "smaps_rollup").read_text().splitlines()
-                sizes.append(next(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:")))
-        except OSError:
-            continue
+    for pid in processes_of(title):
+        with suppress(OSError):
+            if parent in ancestors(pid):
+                rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
+                sizes.append(1024 * int(rollup.partition("\nPss:")[2].split()[0]))
     return sizes
 
 
@@ -82,61 +63,55 @@ def ancestors(pid: int) -> Iterator[int]:
         pid = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
-def at_once(url: str) -> Callable[[], None]:
+def at_once(url: str, pictures: Sequence[bytes]) -> Callable[[], None]:
     """A run of several robots that send one picture after the other."""
 
     def drive(number: int) -> None:
         with Link(url) as link:
             for view in range(N_EACH):
-                link.ask("POST", URL, picture(number + view), JPEG)
+                link.ask("POST", URL, pictures[number + view], JPEG)
 
     def run() -> None:
-        robots = [threading.Thread(target=drive, args=[number]) for number in range(N_ROBOTS)]
-        for robot in robots:
-            robot.start()
-        for robot in robots:
-            robot.join()
+        with ThreadPoolExecutor(N_ROBOTS) as pool:
+            list(pool.map(drive, range(N_ROBOTS)))
 
     return run
 
 
 def report(n_repeats: int) -> Iterator[str]:
     """Markdown lines."""
+    pictures = grainy_jpegs(40)
     with work_folder() as folder:
-        store = f"file://{folder}/store"
-        make_domain(folder / "encoders-1")
+        make_domain(folder / "encoders-1", pictures)
         shutil.copytree(folder / "encoders-1", folder / "encoders-0")
-        plain, without_encoder, with_encoder = (
-            LocalServer(folder / "plain"),
-            fleet_of(folder, 0, store + "-0"),
-            fleet_of(folder, 1, store + "-1"),
-        )
         shutil.copytree(folder / "encoders-1", folder / "plain")
+        plain = LocalServer(folder / "plain")
+        quiet, options = {"DEEPSIMBAD_LOG_LEVEL": "WARNING"}, ("--replicas", str(N_REPLICAS), "--encoders")
+        without_encoder, with_encoder = (
+            fleet_of(folder / f"encoders-{n}", folder / f"store-{n}", quiet, *options, str(n)) for n in range(2)
+        )
+        servers = (plain, without_encoder, with_encoder)
         with plain, without_encoder, with_encoder:
-            body = picture(7)
-            links = [Link(server.url) for server in (plain, without_encoder, with_encoder)]
+            body = pictures[7]
+            links = [Link(server.url) for server in servers]
             answers = [link.ask("POST", URL, body, JPEG) for link in links]
             for answer in answers:
                 del answer["timings_ms"]
             is_same = all(answer == answers[0] for answer in answers)
             alone = interleaved([lambda link=link: link.ask("POST", URL, body, JPEG) for link in links], n_repeats, 20)
-            together = interleaved([at_once(server.url) for server in (plain, without_encoder, with_encoder)], 3)
+            together = interleaved([at_once(server.url, pictures) for server in servers], 3)
             sizes = [
-                [memory(server.pid, title) for title in ("domains-", "admin", "encoder")]
-                for server in (without_encoder, with_encoder)
+                [memory(server.pid, title) for title in ("domains-", "admin", "encoder")] for server in servers[1:]
             ]
-    yield "# One encoder for a fleet"
-    yield ""
+    yield from ("# One encoder for a fleet", "")
     yield (
         f"Made by `python -m bench.fleet_encoder`: a plain service and two fleets of {N_REPLICAS} replicas, one whose "
         "processes have networks of their own and one with an encoder, all up at once and asked in turn for the place "
         "of a JPEG of 640 x 480 pixels by the default network. Memory is the proportional set size: what processes "
         f"share is counted once. The three answers are {'equal' if is_same else '**not** equal'}."
     )
-    yield ""
-    yield machine()
-    yield f"Load average at the end: {', '.join(f'{load:.1f}' for load in os.getloadavg())}."
-    yield ""
+    yield from ("", machine())
+    yield from (f"Load average at the end: {', '.join(f'{load:.1f}' for load in os.getloadavg())}.", "")
 
     def mean_size(sizes: list[int]) -> str:
         return f"{np.mean(sizes) / MEBIBYTE:.0f} MiB" if sizes else "-"

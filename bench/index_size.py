@@ -26,8 +26,7 @@ _MARGIN = 1.1  # of the smaller order-1 model
 
 def index_table() -> Iterator[str]:
     """Markdown lines."""
-    yield "## Index: bits a map image, h = 4"
-    yield ""
+    yield from ("## Index: bits a map image, h = 4", "")
     head = ("map", "images", "r", "as numbers", "order-1 by place", "order-1 by list", "xz", "code", "in its file")
     limits = []
     rows = []

@@ -204,8 +204,7 @@ def rehearsed(case: Case, built_map: Built, landmarks: NDArray[np.float32], list
 def report() -> Iterator[str]:
     """The lines of the page."""
     all_cases = cases()
-    yield "# Landmarks: how many, chosen how"
-    yield ""
+    yield from ("# Landmarks: how many, chosen how", "")
     yield (
         "h = 4, one session over the test drive, tolerance 2 m, every order of the drives. Images (the corridor, and "
         "600 places of Nordland) are encoded by the default extractor. One season: landmarks from the map's own drive. "

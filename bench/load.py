@@ -232,10 +232,8 @@ def report(result: Load, observe_every_s: float) -> Iterator[str]:
     yield ""
     yield f"Made by `make load`: {N_ROBOTS} robots with an observation every {observe_every_s:g} s each, sessions of"
     yield f"{SESSION_LENGTH} views whose true positions are fed back, on a domain of {N_IMAGES:,} map images that is"
-    yield "remapped, rolled back and forward all the while, with traverses coming and going."
-    yield ""
-    yield f"{machine()}; robots, remaps and service share it."
-    yield ""
+    yield from ("remapped, rolled back and forward all the while, with traverses coming and going.", "")
+    yield from (f"{machine()}; robots, remaps and service share it.", "")
     spread = (
         f"median {np.median(spent_ms):.1f} ms, 99 % within {np.quantile(spent_ms, 0.99):.1f} ms, "
         f"longest {spent_ms.max():.0f} ms"
@@ -248,9 +246,7 @@ def report(result: Load, observe_every_s: float) -> Iterator[str]:
         "an observation, durable": spread,
     }
     yield from markdown(("", ""), rows.items())
-    yield ""
-    yield "The service's process, medians over the quarters of the run:"
-    yield ""
+    yield from ("", "The service's process, medians over the quarters of the run:", "")
     quarters = [(number + 1, result.quarter(number)) for number in range(4)]
     memory = [(number, f"{part.rss_mb:.0f}", part.n_handles, part.n_threads) for number, part in quarters]
     yield from markdown(("quarter", "resident memory, MB", "file handles", "threads"), memory)

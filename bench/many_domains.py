@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.load import Sample
 from bench.measurement import ACTIONS_M, RESULTS, Command, duration, machine, markdown, print_page, timed, work_folder
 from bench.recordings import encoded, netvlad_drives, real_recordings
 from bench.worlds import LIST_LENGTH, composed_map, scattered_lists
@@ -235,7 +236,7 @@ def write_domains(data_dir: Path, n: int) -> None:
 def directory_lines(n: int, work: Path) -> Iterator[str]:
     """Lines on start, memory, cold and warm answers of a service of n domains, beside one of a single domain."""
     figures: dict[str, dict[int, str]] = {}
-    n_bytes = {}
+    memory_mib = {}
     view = np.random.default_rng(1).normal(size=64).tolist()
     for n_made in (1, n):
         folder = work / f"domains-{n_made}"
@@ -245,7 +246,7 @@ def directory_lines(n: int, work: Path) -> Iterator[str]:
             start_s = time.perf_counter()
             with LocalServer(folder) as server, Client(server.url) as client:
                 ready_s = time.perf_counter() - start_s
-                n_bytes[n_made] = resident_bytes(server.pid)
+                memory_mib[n_made] = Sample.of(server.pid).rss_mb
 
                 def ask(name: str, client: Client = client) -> None:
                     client.localize(name, encoding=view)
@@ -260,7 +261,7 @@ def directory_lines(n: int, work: Path) -> Iterator[str]:
 
                 together = timed(ask_all, 20, 2) if domains else None
         figures.setdefault("ready after", {})[n_made] = duration(ready_s)
-        figures.setdefault("memory when ready", {})[n_made] = f"{n_bytes[n_made] / 2**20:.0f} MiB"
+        figures.setdefault("memory when ready", {})[n_made] = f"{memory_mib[n_made]:.0f} MiB"
         figures.setdefault("warm answer", {})[n_made] = str(warm)
         if cold_s:
             figures["cold answer, median / p99"] = {
@@ -270,13 +271,7 @@ def directory_lines(n: int, work: Path) -> Iterator[str]:
     yield from (machine(), "", f"Load when it ended: {os.getloadavg()[0]:.1f}. Files lie in the system's cache.", "")
     rows = ((figure, *(values.get(count, "") for count in (1, n))) for figure, values in figures.items())
     yield from markdown(("", "one domain", f"{n:,} domains"), rows)
-    yield from ("", f"Memory of a further domain: {(n_bytes[n] - n_bytes[1]) / n / 1000:.2f} kB.")
-
-
-def resident_bytes(pid: int) -> int:
-    """Resident memory of a process."""
-    fields = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
-    return int(fields[1]) * os.sysconf("SC_PAGE_SIZE")
+    yield from ("", f"Memory of a further domain: {(memory_mib[n] - memory_mib[1]) * 2**20 / n / 1000:.2f} kB.")
 
 
 def page(data: Path, work: Path) -> Iterator[str]:

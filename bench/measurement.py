@@ -96,8 +96,7 @@ def work_folder(folder: Path | None = None) -> Iterator[Path]:
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
     """A table, line by line, as its rows are measured."""
-    yield f"| {' | '.join(head)} |"
-    yield "|---" * len(head) + "|"
+    yield from (f"| {' | '.join(head)} |", "|---" * len(head) + "|")
     for row in rows:
         yield f"| {' | '.join(map(str, row))} |"
 

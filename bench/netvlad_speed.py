@@ -151,8 +151,7 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
 
 def report() -> Iterator[str]:
     """The lines of the page."""
-    yield "# Speed of NetVLAD"
-    yield ""
+    yield from ("# Speed of NetVLAD", "")
     yield (
         f"The whole network at {WIDTH} x {HEIGHT}: VGG16, {N_CLUSTERS} clusters, whitening to {N_WHITENED:,} numbers. "
         "Made by `python -m bench.netvlad_speed`, which explains what is compared; medians, and in brackets the range, "

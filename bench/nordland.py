@@ -117,8 +117,7 @@ def make_domain(client: Client, drives: dict[str, Path]) -> None:
 
 def report(measured: Measured) -> Iterator[str]:
     """The lines of the page."""
-    yield "# Nordland over HTTP: map summer, drive winter"
-    yield ""
+    yield from ("# Nordland over HTTP: map summer, drive winter", "")
     yield (
         "Real images, posted one by one to a running service, each localized on its own (stateless: the map's "
         "statistics alone). Landmarks come from another part of the route: `composed` has no second season to learn "

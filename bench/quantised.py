@@ -99,8 +99,7 @@ def session_scores(built_map: Built, places: NDArray[np.float32], test: Drive) -
 def report() -> Iterator[str]:
     """The lines of the page."""
     drives = netvlad_drives()
-    yield "# Composed beside product and residual quantisation"
-    yield ""
+    yield from ("# Composed beside product and residual quantisation", "")
     yield (
         "Three drives of the Nordland railway (`nordland_netvlad64`), all six orders, h = 4, one session, percent. "
         "`f`, `u`: the unit vectors of places that composed lists stand for, of two seasons and of one. Quantisers' "

@@ -4,7 +4,6 @@ python -m bench.request [CHECKOUT]
 """
 
 import asyncio
-import io
 import json
 import os
 import subprocess
@@ -18,6 +17,7 @@ from statistics import median
 import httpx2
 import numpy as np
 
+from bench.link import NPZ, packed
 from bench.measurement import PROJECT, Command, work_folder
 
 N_IMAGES, N_LANDMARKS, N_WARM, N_MEASURED, N_TURNS = 2000, 300, 100, 600, 4
@@ -61,10 +61,8 @@ async def _seconds(data_dir: Path) -> list[float]:
 
         await call("PUT", DOMAIN, json={"evaluator": {"kind": "feature_l2", "extractor": "none"}})
         await call("POST", f"{DOMAIN}/traverses", json={"name": "t"})
-        packed = io.BytesIO()
-        np.savez(packed, encodings=encodings, index=np.arange(N_IMAGES), position_m=np.arange(float(N_IMAGES)))
-        binary = {"Content-Type": "application/octet-stream"}
-        await call("POST", f"{DOMAIN}/traverses/t/frames", content=packed.getvalue(), headers=binary)
+        batch = packed(encodings=encodings, index=np.arange(N_IMAGES), position_m=np.arange(float(N_IMAGES)))
+        await call("POST", f"{DOMAIN}/traverses/t/frames", content=batch, headers=NPZ)
         drives = {"training_traverse": "t", "landmark_traverse": "t"}
         config = {**drives, "n_landmarks": N_LANDMARKS, "training_episodes": 0}
         job = await call("POST", f"{DOMAIN}/remaps", json=config)

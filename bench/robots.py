@@ -102,3 +102,14 @@ def jpegs(n_pictures: int) -> list[bytes]:
     renderer = Renderer(world, Drive(world.route, 0, date, n_pictures, spacing_m))
     upright = (cv2.rotate(renderer.stored_picture(frame), cv2.ROTATE_90_CLOCKWISE) for frame in range(n_pictures))
     return [cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes() for picture in upright]
+
+
+def grainy_jpegs(n_pictures: int) -> list[bytes]:
+    """JPEG files of 640 x 480 pixels, about 90 kB each: smooth shapes with the grain of a camera."""
+    rng = np.random.default_rng(0)
+    bodies = []
+    for _ in range(n_pictures):
+        coarse = cv2.resize(rng.integers(0, 256, (24, 32, 3), np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
+        grainy = np.clip(coarse + rng.normal(0, 6, coarse.shape), 0, 255).astype(np.uint8)
+        bodies.append(cv2.imencode(".jpg", grainy, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+    return bodies

@@ -34,8 +34,7 @@ def mapped_service(**arrays: np.ndarray) -> Iterator[LocalServer]:
 
 def http_table() -> Iterator[str]:
     """Markdown lines."""
-    yield f"## HTTP: `POST localizations` on loopback, {NCLT_IMAGES:,} map images, one client"
-    yield ""
+    yield from (f"## HTTP: `POST localizations` on loopback, {NCLT_IMAGES:,} map images, one client", "")
     ranked, rows = np.random.default_rng(0).permutation(N_LANDMARKS).tolist(), []
     path, headers = "/v1/domains/bench/localizations", {"Content-Type": "application/json"}
     with mapped_service() as server, Client(server.url) as client, Link(server.url) as link:
@@ -80,8 +79,7 @@ def session_table() -> Iterator[str]:
 
 def restart_table() -> Iterator[str]:
     """Markdown lines."""
-    yield f"## Restart: from `kill -9` to a ready service, {NCLT_IMAGES:,} map images"
-    yield ""
+    yield from (f"## Restart: from `kill -9` to a ready service, {NCLT_IMAGES:,} map images", "")
     seconds = []
     with mapped_service() as server:
         for _ in range(_KILLS):

@@ -23,14 +23,11 @@ def report(result: Soak) -> Iterator[str]:
     """Markdown lines."""
     ready, empty = np.array(result.ready_s), np.array(result.empty_ready_s)
     longest = int(ready.argmax())
-    yield "# kill -9 under load"
-    yield ""
+    yield from ("# kill -9 under load", "")
     yield "Made by `make soak`: the service is killed at random moments while robots observe, begin and end sessions,"
     yield "traverses are uploaded and deleted, and maps are made, activated and rolled back; then everything that was"
     yield "acknowledged is looked for. A run that misses anything, or finds a damaged file, ends with an error instead."
-    yield ""
-    yield machine()
-    yield ""
+    yield from ("", machine(), "")
     kills = (
         f"kills, each 0 to {LONGEST_LIFE_S:g} s after the service was ready: in turn at any time, during an upload, "
         "a remap, an activation, a rollback"
@@ -52,9 +49,7 @@ def report(result: Soak) -> Iterator[str]:
     yield "A machine that is busy slows both kinds of start; a ratio that grows is the service's own doing."
     yield ""
     yield from limit_table(limits(result))
-    yield ""
-    yield "What uploader and mapper were about when it died (robots observe all the time):"
-    yield ""
+    yield from ("", "What uploader and mapper were about when it died (robots observe all the time):", "")
     yield from markdown(("", "kills"), sorted(result.doing.items(), key=lambda item: -item[1]))
 
 
