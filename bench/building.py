@@ -52,8 +52,8 @@ def landmark_table() -> Iterator[str]:
 def _in_own_process(task: str) -> dict[str, float]:
     """The figures that `measure` prints for a task, in a process of its own, whose peak of memory is the task's."""
     command = [sys.executable, "-m", "bench.building", task]
-    process = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own interpreter
-    return dict(json.loads(process.stdout))
+    output = subprocess.check_output(command)  # noqa: S603 - our own interpreter
+    return dict(json.loads(output))
 
 
 def map_file_table() -> Iterator[str]:

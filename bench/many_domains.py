@@ -112,38 +112,37 @@ def worlds(data: Path, work: Path) -> Iterator[World]:
     yield World("of these the railways alone, views of none are of the corridor and a campus", railway, views)
 
 
+def quality_row(world: World, likeliest: list[tuple[float, bool]]) -> Sequence[object]:
+    """The cells of a world; the probability of every view's likeliest domain, and whether that is true, are added."""
+    atlas, names = Atlas(list(world.maps.values())), list(world.maps)
+    right, on_route, off_route = [], [], []
+    for view, truth in world.views:
+        log_evidences = dict(zip(names, atlas.log_evidences(view).tolist(), strict=True))
+        probabilities, elsewhere_probability = posterior(log_evidences)
+        if truth is None:
+            off_route.append(elsewhere_probability)
+            continue
+        best = max(probabilities, key=lambda name: probabilities[name])
+        right.append(best == truth)
+        on_route.append(elsewhere_probability)
+        likeliest.append((probabilities[best], best == truth))
+    bar = float(np.quantile(on_route, 0.95))
+    return (
+        *(world.name, len(names), len(right), f"{100 * np.mean(right):.0f} %", f"{100 / len(names):.0f} %"),
+        *(f"{np.median(on_route):.3f} / {np.median(off_route):.3f}", len(off_route)),
+        f"{100 * np.mean(np.array(off_route) > bar):.0f} %",
+    )
+
+
 def quality_lines(data: Path, work: Path) -> Iterator[str]:
     """Lines of two tables: how often the true domain is the likeliest, and how often at which probability."""
     likeliest: list[tuple[float, bool]] = []
-    rows = []
-    for world in worlds(data, work):
-        atlas, names = Atlas(list(world.maps.values())), list(world.maps)
-        right, on_route, off_route = [], [], []
-        for view, truth in world.views:
-            probabilities, elsewhere_probability = posterior(
-                dict(zip(names, atlas.log_evidences(view).tolist(), strict=True))
-            )
-            best = max(probabilities, key=lambda name: probabilities[name])
-            if truth is None:
-                off_route.append(elsewhere_probability)
-                continue
-            right.append(best == truth)
-            on_route.append(elsewhere_probability)
-            likeliest.append((probabilities[best], best == truth))
-        bar = float(np.quantile(on_route, 0.95))
-        rows.append(
-            (
-                *(world.name, len(names), len(right), f"{100 * np.mean(right):.0f} %", f"{100 / len(names):.0f} %"),
-                *(f"{np.median(on_route):.3f} / {np.median(off_route):.3f}", len(off_route)),
-                f"{100 * np.mean(np.array(off_route) > bar):.0f} %",
-            )
-        )
     yield from markdown(
         (
             *("domains", "how many", "views of them", "true one likeliest", "by chance"),
             *("median `elsewhere`: views of them / of none", "views of none", "above 95 % of the views of them"),
         ),
-        rows,
+        (quality_row(world, likeliest) for world in worlds(data, work)),
     )
     yield from (
         "",

@@ -51,7 +51,7 @@ class Command(ArgumentParser):
 
 
 def one_of(names: Collection[str]) -> Callable[[str], str]:
-    """The type of an argument that is one of some names; of any number of them argparse takes no `choices`."""
+    """The type of arguments that are some of the names, perhaps none, which `choices` would refuse."""
 
     def checked(word: str) -> str:
         if word not in names:
@@ -88,7 +88,7 @@ def print_page(lines: Iterable[str], page: Path | None = None) -> None:
 @contextmanager
 def work_folder(folder: Path | None = None) -> Iterator[Path]:
     """A folder to work in, made where it is not there; None: a temporary one."""
-    with TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+    with TemporaryDirectory(ignore_cleanup_errors=True) as temporary:  # a fleet's processes may write on for a moment
         work = folder or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)
         yield work

@@ -31,8 +31,8 @@ def compare(checkouts: Sequence[Path]) -> None:
             folders = [checkout.resolve(strict=True) / name for name in ("service", "client", "migrations")]
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
             command = [sys.executable, "-m", "bench.request", "--measure"]
-            process = subprocess.run(command, cwd=PROJECT, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - itself
-            print(f"turn {turn + 1}, {checkout}: {float(process.stdout):.2f} ms")
+            output = subprocess.check_output(command, cwd=PROJECT, env=environment)  # noqa: S603 - itself
+            print(f"turn {turn + 1}, {checkout}: {float(output):.2f} ms")
 
 
 def measure() -> None:
