@@ -124,6 +124,7 @@ def test_the_keyboard_reaches_all_of_every_page(open_page, session, pages):
         missed = page.evaluate(f"{REACHABLE}.filter((part) => !part.reached).map((part) => part.outerHTML)")
         assert missed == [], fragment
     page.goto(page.url.partition("#")[0] + f"#sessions/{session.session_id}")
+    page.get_by_text("After 3 views").wait_for()
     slider = page.get_by_label("Step shown")
     slider.press("ArrowLeft")
     page.get_by_text("After 2 views").wait_for()
