@@ -54,10 +54,12 @@ def make(client, domain, evaluator=SIAMESE):
 def _short_fit(monkeypatch):
     """For tests of the way of a fit, not of what it learns."""
     monkeypatch.setattr("deepsimbad.evaluators.siamese._EPOCHS", 8)
+    monkeypatch.setattr("deepsimbad.evaluators.autoencoder._EPOCHS", 30)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["siamese", "autoencoder"])
+@pytest.mark.usefixtures("_short_fit")
 def test_images_wait_are_fitted_and_deleted_and_the_map_answers_every_kind_of_view(client, tmp_path, kind):
     domain, views = f"fitted-{kind}", street(2)
     make(client, domain, {**SIAMESE, "kind": kind})

@@ -104,7 +104,7 @@ def test_the_papers_set_up_agrees_with_the_slow_reference(drives, report):
 def test_real_netvlad_in_order_of_what_they_know(real_data, evaluator):
     folder, roles = real_data / "nordland_netvlad64", ("landmarks", "training", "test")
     sources = {role: str(folder / f"{name}.npy") for role, name in zip(roles, ("nr", "nq", "nq2"), strict=True)}
-    report = experiment(sources, evaluator, NbvConfig(episodes=150, training_episodes=500))
+    report = experiment(sources, evaluator, NbvConfig(episodes=75, training_episodes=500))
     mean, paper = (
         {name: shares_of(episodes).mean() for name, episodes in setup.items()}
         for setup in (report.our_episodes, report.paper_episodes)
@@ -112,7 +112,7 @@ def test_real_netvlad_in_order_of_what_they_know(real_data, evaluator):
     assert mean["clairvoyant"] < mean["informed"] < mean["random"]
     assert all(mean[name] < paper[name] for name in mean)
     rows = [np.load(path).astype(np.float64) for path in sources.values()]
-    expected = slow_paper(rows, report.config, np.full((150, 10), 5.0))
+    expected = slow_paper(rows, report.config, np.full((75, 10), 5.0))
     assert 100 * paper["constant_5"] == pytest.approx(100 * expected.mean(), abs=0.01)
 
 

@@ -67,7 +67,7 @@ def slow_lists(places, landmarks, weights, width=8):
         best = [()]
         for _ in weights:
             longer = [(*prefix, k) for prefix in best for k in range(len(landmarks)) if k not in prefix]
-            sums = np.array([weights[: len(prefix)] @ landmarks[list(prefix)] for prefix in longer])
+            sums = weights[: len(longer[0])] @ landmarks[np.array(longer)]
             best = [longer[at] for at in np.argsort(-(unit(sums) @ place), kind="stable")[:width]]
         lists.append(best[0])
     return np.array(lists)
