@@ -116,7 +116,7 @@ def test_vpr_drives_in_order_unless_every_view_is_by_itself(measured, triplet):
 
 
 def test_how_much_lists_owe_to_their_own_places_landmarks(measure, deepsimbad, route):
-    arguments = ("vpr", *route, *READY[:2], "--n-landmarks", 60, *COMPOSED)
+    arguments = ("vpr", *route, *READY[:2], "--n-landmarks", 60, *COMPOSED, "--stateless")
     document, barred_document = measure(*arguments), measure(*arguments, "--bar-own-place")
     assert set(barred_document["anr"]) == {"composed", "brute_force_u"}
     assert barred_document["anr"]["composed"] > document["anr"]["composed"]
@@ -167,7 +167,7 @@ def test_landmarks_of_another_season_are_told_from_those_of_elsewhere(measure, d
 
     def season(landmarks, *options):
         sources = triplet_of(*(drives / f"{name}.npy" for name in (landmarks, "summer", "summer")))
-        return measure("vpr", *sources, *READY, *COMPOSED, *options)["second_season"]
+        return measure("vpr", *sources, *READY, *COMPOSED, "--stateless", *options)["second_season"]
 
     assert season("winter")["accepted"]
     assert not season("landmarks")["accepted"]
@@ -204,7 +204,7 @@ def test_a_test_drive_that_was_learnt_from_is_warned_of_whatever_it_is_called(me
         ((landmarks, copy), ["training"]),
         ((winter, copy), ["landmarks", "training"]),
     ):
-        document = measure("vpr", *triplet_of(*sources, winter), *READY, *COMPOSED)
+        document = measure("vpr", *triplet_of(*sources, winter), *READY, *COMPOSED, "--stateless")
         warnings = "\n".join(document["warnings"])
         assert re.findall(r"^test_drive_known: .* the (\w+) drive", warnings, re.MULTILINE) == roles
     assert document["second_season"] is None, "one drive under two names is one season"

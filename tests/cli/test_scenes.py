@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from deepsimbad.jobs.experiments import calibration
 from deepsimbad_client.commands import run
 
 from ..client.conftest import serving
@@ -64,7 +65,9 @@ def scene_drives(tmp_path_factory):
         *(("calibration", OBJECTS), ("calibration", "autoencoder:gradient_grid")),
     ],
 )
-def test_experiments_take_every_evaluator(deepsimbad, scene_drives, kind, evaluator):
+def test_experiments_take_every_evaluator(deepsimbad, scene_drives, monkeypatch, kind, evaluator):
+    for views in ("_STANDING_VIEWS", "_SEARCHING_VIEWS"):  # most of what a calibration looks at
+        monkeypatch.setattr(calibration, views, 5)
     landmarks, training, test = scene_drives
     sources = ("--landmarks", landmarks, "--training", training, "--test", test, "--evaluator", evaluator)
     quick_options = {
