@@ -1,14 +1,16 @@
 """The front camera: an upright pinhole 1.2 m above the ground, and the canvas it sees the world on."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]  # [height, width, 3] blue, green, red, where nothing else is said
-Colour = tuple[float, ...]  # blue, green, red, 0..255
+Colour = Sequence[float]  # blue, green, red, 0..255
+Pair = Array | tuple[float, float]
 
 UPRIGHT_SIZE = (1232, 1616)  # width and height of a picture the right way up; it is stored turned counter-clockwise
 WIDTH, HEIGHT = 560, 728  # of the canvas
@@ -74,6 +76,13 @@ def fill(image: Image, ground: Array, ink: Colour) -> None:
         cv2.fillConvexPoly(image, outline, ink, cv2.LINE_8 if is_mask else cv2.LINE_AA, 4)
 
 
-def ink(colour: Array) -> tuple[int, ...]:
+def window(canvas: Image, low: Pair, high: Pair) -> tuple[tuple[int, int], Image]:
+    """The first pixel (x, y) of the part of the canvas between two corners, and the part, which may be empty."""
+    left, top, right, bottom = np.clip([*low, *high], 0, (WIDTH, HEIGHT) * 2).astype(int).tolist()
+    return (left, top), canvas[top:bottom, left:right]
+
+
+def ink(colour: ArrayLike) -> list[int]:
     """A colour as OpenCV draws with it."""
-    return tuple(min(max(int(value), 0), 255) for value in colour.tolist())
+    values: list[int] = np.clip(colour, 0, 255).astype(int).tolist()
+    return values

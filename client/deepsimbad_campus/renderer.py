@@ -1,6 +1,5 @@
 """Pictures of one drive, painted from back to front: sky, ground, and what stands on it."""
 
-from collections.abc import Callable
 from functools import lru_cache, partial
 from itertools import pairwise
 from operator import itemgetter
@@ -9,9 +8,9 @@ import cv2
 import numpy as np
 
 from deepsimbad_campus import camera, pictures, things
-from deepsimbad_campus.camera import FOCAL_PX, GROUND_ROW, HEIGHT, HORIZON_Y, WIDTH, Array, Image, View, fill, ink
+from deepsimbad_campus.camera import FOCAL_PX, GROUND_ROW, HEIGHT, HORIZON_Y, WIDTH, Array, Colour, Image, View, fill
 from deepsimbad_campus.route import Drive, stream
-from deepsimbad_campus.season import Light, season_of
+from deepsimbad_campus.season import Light, Season
 from deepsimbad_campus.things import Shot
 from deepsimbad_campus.world import SIGHT_M, World
 
@@ -21,6 +20,7 @@ GLARE_PX, DRIFT_DEG_PER_FRAME = 420, 0.06
 BANDS_M = (0.0, 4.0, 10.0, 24.0, 55.0, 1e9)  # distances at which a coarser picture of the ground takes over
 LONGEST_SHADOW_M = 45.0
 LABELS = {name: label for label, name in enumerate(("grass", *pictures.PAVING))}
+GROUND_SHAPE = (HEIGHT - GROUND_ROW, WIDTH)
 
 
 class Renderer:
@@ -29,7 +29,7 @@ class Renderer:
     def __init__(self, world: World, drive: Drive) -> None:
         self._world, self._drive = world, drive
         date, seed, number = drive.date.isoformat(), world.seed, drive.date.toordinal()
-        self._season = season = season_of(drive.date, seed)
+        self._season = season = Season(drive.date, seed)
         self._skyline, self._dome = world.skyline(), pictures.draw_sky(season, stream(seed, f"sky {date}"))
         radius = np.hypot(*np.mgrid[-GLARE_PX:GLARE_PX, -GLARE_PX:GLARE_PX]) / GLARE_PX
         self._glare = np.clip(1 - radius, 0, 1)[:, :, None] ** 3.0 * np.array(season.sun)
@@ -49,28 +49,28 @@ class Renderer:
         x, y = WIDTH / 2, HEIGHT / 2 - nod
         (wide, tall), (width, height) = camera.SEEN_SIZE, camera.UPRIGHT_SIZE
         turn = np.array([[sin, cos, tall / 2 - sin * x - cos * y], [-cos, sin, wide / 2 + cos * x - sin * y]])
-        window = cv2.warpAffine(self.canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
+        window = cv2.warpAffine(self._canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
         picture = cv2.resize(window, (height, width), interpolation=cv2.INTER_LINEAR)
         row, column = stream(self._world.seed + self._drive.date.toordinal(), "grain", frame).integers(0, 64, 2)
         grain = self._grain[row : row + width, column : column + height]
         return np.asarray(cv2.addWeighted(picture, 1.0, grain, 1.0, -128), np.uint8)
 
-    def canvas(self, frame: int, view: View) -> Image:
+    def _canvas(self, frame: int, view: View) -> Image:
         """[728, 560, 3] BGR, the picture of a frame as drawn: upright, level and without grain."""
         season, drive, canvas = self._season, self._drive, np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         sunshine = float(np.clip(0.5 + 1.6 * (drive.sunniness[frame] - 2.4 * (season.cloud_share - 0.5)), 0, 1))
-        light = Light(season, sunshine, float(drive.exposure[frame]))
-        shot = Shot(canvas, view, light, float(drive.position_m[frame]), self.trees)
+        light, position_m = Light(season, sunshine, float(drive.exposure[frame])), float(drive.position_m[frame])
+        shot = Shot(canvas, view, light, position_m, self._world.ahead(position_m), self.trees)
         self._paint_sky(shot, frame)
         turn = (np.deg2rad(season.sun_azimuth_deg) - view.heading_rad + np.pi) % (2 * np.pi) - np.pi
         x = int(camera.CENTRE_X + FOCAL_PX * np.tan(turn))
         y = int(HORIZON_Y - FOCAL_PX * np.tan(np.deg2rad(season.sun_elevation_deg)) / np.cos(turn))
-        dazzling = abs(turn) <= 1.05 and sunshine > 0.3
-        if dazzling:
+        is_dazzling = abs(turn) <= 1.05 and sunshine > 0.3
+        if is_dazzling:
             self._glow(canvas, x, y, 1.5 * sunshine)
         self._paint_ground(shot)
         self._draw_things(shot, frame)
-        if dazzling and 0 <= x < WIDTH and 0 <= y < HEIGHT and canvas[y, x].min() > 200:  # nothing stands before it
+        if is_dazzling and 0 <= x < WIDTH and 0 <= y < HEIGHT and canvas[y, x].min() > 200:  # nothing stands before it
             self._glow(canvas, x, y, 0.8 * sunshine)
             rows = canvas[max(0, y - 1) : y + 2]  # it bleeds along the sensor's columns, which lie level
             cv2.add(rows, np.full_like(rows, 110), dst=rows)
@@ -91,25 +91,24 @@ class Renderer:
             top = HORIZON_Y - FOCAL_PX * np.tan(height) / np.cos(np.deg2rad(camera.AZIMUTH_DEG))
             corners = [[WIDTH - 1, HORIZON_Y + 3], [0, HORIZON_Y + 3]]
             outline = np.concatenate([np.stack([np.arange(WIDTH), top], axis=1), corners])
-            colour = ink(woods * light.in_shade * (1 - share) + light.air * share)
+            colour = camera.ink(woods * light.gain(0) * (1 - share) + light.air * share)
             cv2.fillPoly(shot.canvas, [np.round(outline).astype(np.int32)], colour)
 
     def _glow(self, canvas: Image, x: int, y: int, strength: float) -> None:
         """Add the sun's glow around a pixel that may lie outside of the canvas."""
-        left, top = x - GLARE_PX, y - GLARE_PX
-        roi = canvas[max(0, top) : max(0, y + GLARE_PX), max(0, left) : max(0, x + GLARE_PX)]
-        part = self._glare[max(0, -top) :, max(0, -left) :][: roi.shape[0], : roi.shape[1]]
+        (left, top), roi = camera.window(canvas, (x - GLARE_PX, y - GLARE_PX), (x + GLARE_PX, y + GLARE_PX))
+        part = self._glare[top - y + GLARE_PX :, left - x + GLARE_PX :][: roi.shape[0], : roi.shape[1]]
         if roi.size:
             cv2.add(roi, np.clip(part * strength, 0, 255).astype(np.uint8), dst=roi)
 
     def _draw_things(self, shot: Shot, frame: int) -> None:
-        queue: list[tuple[float, Callable[[], None]]] = []
-        for section in self._world.ahead(shot.position_m):
-            for feet, style in section.facades:
-                north, east = (feet[1] - feet[0]) / np.hypot(*(feet[1] - feet[0]))
-                gain = shot.light.gain(-east * shot.light.sun[0] + north * shot.light.sun[1])  # its normal points right
-                for ahead, ends, span in things.panels(feet, shot.view):
-                    queue.append((ahead, partial(things.draw_panel, shot, self._facade, style, gain, ends, span)))
+        queue: list[tuple[float, partial[None]]] = []
+        for feet, style in (facade for section in shot.sections for facade in section.facades):
+            north, east = (feet[1] - feet[0]) / np.hypot(*(feet[1] - feet[0]))
+            gain = shot.light.gain(-east * shot.light.sun[0] + north * shot.light.sun[1])  # its normal points right
+            for ends, span in things.panels(feet, shot.view):
+                draw = partial(things.draw_panel, shot, self._facade(style), style.height_m, gain, ends, span)
+                queue.append((ends[:, 1].mean(), draw))
         for thing in things.around(self._world, self._drive, frame):
             kind, foot = things.KINDS[thing.kind], shot.view.to_camera(thing.place)
             if camera.NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * camera.HALF_VIEW + kind.margin_m:
@@ -118,14 +117,14 @@ class Renderer:
             draw()
 
     def _paint_ground(self, shot: Shot) -> None:
-        light, ground, labels, shadows = shot.light, shot.canvas[GROUND_ROW:], self._labels(shot), self._shadows(shot)
+        light, ground, labels, shadows = shot.light, shot.canvas[GROUND_ROW:], self._labels(shot), _shadows(shot)
         for level, (near, far) in enumerate(pairwise(BANDS_M)):
             rows = np.flatnonzero((near <= camera.AHEAD_M) & (far > camera.AHEAD_M))
             band = slice(rows[0], rows[-1] + 1)
             painted = self._surfaces(camera.AHEAD_M[band], level, shot.view, labels[band])
             distance = min(camera.AHEAD_M[band].mean(), 90.0)
-            ground[band] = light.shine_on(painted, light.on_ground, distance)
-            cv2.copyTo(light.shine_on(painted, light.in_shade, distance), shadows[band], ground[band])
+            ground[band] = light.shine_on(painted, light.on_ground(1.0), distance)
+            cv2.copyTo(light.shine_on(painted, light.gain(0), distance), shadows[band], ground[band])
         self._mark(shot)
 
     def _surfaces(self, ahead_m: Array, level: int, view: View, labels: Image) -> Image:
@@ -137,7 +136,7 @@ class Renderer:
         north = (ahead * cos - right * sin + np.float32(view.north_m % pictures.TILE_M)) * scale
         east = (ahead * sin + right * cos + np.float32(view.east_m % pictures.TILE_M)) * scale
         painted = np.zeros((*labels.shape, 3), np.uint8)
-        for label in np.flatnonzero(np.bincount(labels.ravel())):
+        for label in np.unique(labels):
             tile = self._tiles[label][level]
             layer = cv2.remap(tile, east, north, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
             cv2.copyTo(layer, (labels == label).view(np.uint8), painted)
@@ -145,70 +144,65 @@ class Renderer:
 
     def _labels(self, shot: Shot) -> Image:
         """[HEIGHT - GROUND_ROW, WIDTH] index of the tile that every pixel below the horizon is paved with."""
-        labels = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8)
-        sections, position_m = self._world.ahead(shot.position_m), shot.position_m
+        labels, position_m, route = np.zeros(GROUND_SHAPE, np.uint8), shot.position_m, self._world.route
         # Short pieces of path near by, where a bend shows; long ones far away.
-        cuts_m = position_m + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 125, 9)])
-        for section in sections:
+        cuts_m = position_m + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 126, 9)])
+        for section in shot.sections:
             for outline, surface in section.patches:
                 fill(labels, shot.view.to_camera(outline), (LABELS[surface],))
-        for section in reversed(sections):
+        for section in reversed(shot.sections):
             first, last = max(section.stretch.start_m, position_m - 4), min(section.stretch.end_m, position_m + 125)
             if first < last:
-                path_m = np.concatenate([[first], cuts_m[(first < cuts_m) & (cuts_m < last)], [last]])
-                half, route = section.path_half_width_m, self._world.route
+                path_m, half = np.unique(np.clip(cuts_m, first, last)), section.path_half_width_m
                 left, right = (shot.view.to_camera(route.place(path_m, side)) for side in (-half, half))
                 for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
                     fill(labels, quad, (LABELS[section.path_surface],))
         return labels
 
-    def _shadows(self, shot: Shot) -> Image:
-        """[HEIGHT - GROUND_ROW, WIDTH] 255 where the ground is in shade, else 0."""
-        mask, light = np.zeros((HEIGHT - GROUND_ROW, WIDTH), np.uint8), shot.light
-        north, east, up = light.sun
-        reach_per_m, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
-        length_per_m, circle = np.hypot(*reach_per_m), np.stack([np.cos(ring), np.sin(ring)], axis=1)
-        direction, leaves, outlines = reach_per_m / max(length_per_m, 1e-6), light.season.leaf_share, list[Array]()
-        for section in self._world.ahead(shot.position_m) if light.sunshine >= 0.15 else ():
-            for block in section.blocks:
-                reach = reach_per_m * block.height_m
-                reach = reach * min(1.0, LONGEST_SHADOW_M / max(np.hypot(*reach), 1e-6))
-                corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
-                outlines.append(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
-            for place, kind, height, *_ in section.things:
-                reach, ahead = reach_per_m * height * 0.62, shot.view.to_camera(place)[1]
-                if kind in ("tree", "conifer") and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
-                    side = np.array([-direction[1], direction[0]]) * 0.12
-                    outlines.append(place + np.stack([-side, side, reach + side, reach - side]))
-                    bare = leaves < 0.15 and kind == "tree"
-                    spread = circle * (height * (0.12 if bare else 0.16 + 0.12 * leaves))
-                    outlines.append(
-                        place
-                        + reach
-                        + (spread + np.outer(spread @ direction * (1 + 0.5 * length_per_m - 1), direction))
-                    )
-        for outline in outlines:
-            fill(mask, shot.view.to_camera(outline), (255,))
-        return mask
-
     def _mark(self, shot: Shot) -> None:
         """Draw the path's joints and the road's broken line."""
         route, position_m, light = self._world.route, shot.position_m, shot.light
-        joint, paint = (light.colour(c, light.on_ground, 0) for c in ((112, 116, 118), (170, 200, 205)))
+        joint, paint = light.seen([(112, 116, 118), (170, 200, 205)], light.on_ground(1.0), 0).tolist()
 
-        def line(along_m: Array, right_m: Array, width_m: float, ink: tuple[int, ...]) -> None:
-            first, last = route.place(along_m, right_m)
+        def line(along_m: list[float], right_m: list[float], width_m: float, ink: Colour) -> None:
+            first, last = route.place(np.array(along_m), np.array(right_m))
             north, east = last - first
             side = np.array([-east, north]) / max(np.hypot(north, east), 1e-6) * width_m / 2
-            outline = np.stack([first - side, last - side, last + side, first + side])
-            fill(shot.canvas, shot.view.to_camera(outline), ink)
+            fill(
+                shot.canvas, shot.view.to_camera(np.stack([first - side, last - side, last + side, first + side])), ink
+            )
 
-        for section in self._world.ahead(position_m):
-            stretch, half, road = section.stretch, section.path_half_width_m, section.road_right_m
-            if section.path_surface == "concrete":
-                for joint_m in np.arange(stretch.start_m + 2, min(stretch.end_m, position_m + 30), 2.5):
-                    if joint_m > position_m - 2:
-                        line(np.array([joint_m, joint_m]), np.array([-half, half]), 0.03, joint)
+        for section in shot.sections:
+            stretch, half, road_m = section.stretch, section.path_half_width_m, section.road_right_m
+            for joint_m in np.arange(stretch.start_m + 2, min(stretch.end_m, position_m + 30), 2.5):
+                if section.path_surface == "concrete" and joint_m > position_m - 2:
+                    line([joint_m, joint_m], [-half, half], 0.03, joint)
             for dash_m in np.arange(stretch.start_m, stretch.start_m + stretch.straight_m, 6.0):
-                if road is not None and position_m - 4 < dash_m < position_m + 70:
-                    line(np.array([dash_m, dash_m + 3.0]), np.array([road, road]), 0.12, paint)
+                if road_m is not None and position_m - 4 < dash_m < position_m + 70:
+                    line([dash_m, dash_m + 3.0], [road_m, road_m], 0.12, paint)
+
+
+def _shadows(shot: Shot) -> Image:
+    """[HEIGHT - GROUND_ROW, WIDTH] 255 where the ground is in shade, else 0."""
+    mask, light = np.zeros(GROUND_SHAPE, np.uint8), shot.light
+    north, east, up = light.sun
+    reach_per_m, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    length_per_m, circle = np.hypot(*reach_per_m), np.stack([np.cos(ring), np.sin(ring)], axis=1)
+    direction, leaves, outlines = reach_per_m / max(length_per_m, 1e-6), light.season.leaf_share, list[Array]()
+    side = np.array([-direction[1], direction[0]]) * 0.12
+    for section in shot.sections if light.sunshine >= 0.15 else ():
+        for block in section.blocks:
+            reach = reach_per_m * min(block.height_m, LONGEST_SHADOW_M / max(length_per_m, 1e-6))
+            corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
+            outlines.append(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
+        for place, kind, height, *_ in section.things:
+            reach, ahead = reach_per_m * height * 0.62, shot.view.to_camera(place)[1]
+            if kind in ("tree", "conifer") and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
+                outlines.append(place + np.stack([-side, side, reach + side, reach - side]))
+                is_bare = leaves < 0.15 and kind == "tree"
+                crown = circle * (height * (0.12 if is_bare else 0.16 + 0.12 * leaves))
+                stretched = crown + np.outer(crown @ direction * 0.5 * length_per_m, direction)
+                outlines.append(place + reach + stretched)
+    for outline in outlines:
+        fill(mask, shot.view.to_camera(outline), (255,))
+    return mask

@@ -41,7 +41,6 @@ class Stretch(NamedTuple):
     number: int
     start_m: float
     straight_m: float
-    bend_m: float
     end_m: float
 
 
@@ -61,14 +60,13 @@ class Route:
             turn = float(np.clip(offset + turn, -MAX_HEADING_RAD, MAX_HEADING_RAD) - offset)
             bend = max(6.0, np.ceil(abs(turn) * rng.uniform(9, 20) / STEP_M) * STEP_M)
             end = position + straight + bend
-            self.stretches.append(Stretch(len(self.stretches), position, straight, bend, end))
+            self.stretches.append(Stretch(len(self.stretches), position, straight, end))
             headings.append(np.full(int(straight / STEP_M), general + offset))
             headings.append(general + offset + turn * ((np.arange(int(bend / STEP_M)) + 0.5) * STEP_M / bend))
             offset, position = offset + turn, end
         self._heading = np.concatenate(headings)
-        self._north, self._east = (
-            np.concatenate([[0.0], np.cumsum(step) * STEP_M]) for step in (np.cos(self._heading), np.sin(self._heading))
-        )
+        steps = np.stack([np.cos(self._heading), np.sin(self._heading)])
+        self._north, self._east = np.pad(np.cumsum(steps, axis=1) * STEP_M, ((0, 0), (1, 0)))
         self._position = np.arange(len(self._north)) * STEP_M
 
     def heading(self, position_m: Array | float) -> Array:
@@ -81,11 +79,6 @@ class Route:
         north = np.interp(position_m, self._position, self._north) - np.sin(heading) * right_m
         east = np.interp(position_m, self._position, self._east) + np.cos(heading) * right_m
         return np.stack([north, east], axis=-1)
-
-    def between(self, first_m: float, last_m: float) -> Array:
-        """[n, 2] north and east of the centre line's samples between two route positions."""
-        samples = slice(max(0, int(first_m / STEP_M)), int(last_m / STEP_M) + 1)
-        return np.stack([self._north[samples], self._east[samples]], axis=1)
 
 
 def drive_length_m(n_frames: int, spacing_m: float) -> float:
@@ -106,26 +99,23 @@ class Drive:
         moves = [_block_moves(stream(seed, f"moves {date}", k), BLOCK * spacing_m) for k in blocks]
         jitter = [stream(seed, f"clock {date}", k).integers(-20_000, 20_000, BLOCK) for k in blocks]
         rng = stream(seed, f"drive {date}")
-        afternoon = datetime.datetime.combine(date, datetime.time(16), datetime.UTC)
-        start = int(afternoon.timestamp()) * 1_000_000 + int(rng.integers(0, 3_600_000_000))
+        start = np.datetime64(f"{date}T16", "us").astype(np.int64) + rng.integers(0, 3_600_000_000)
         self.utime = start + np.arange(n_frames) * INTERVAL_US + np.concatenate(jitter)[:n_frames]
-        self.position_m = position_m = (START_M + np.concatenate([[0.0], np.cumsum(np.concatenate(moves))]))[:n_frames]
-        frames = np.arange(n_frames, dtype=np.float64)
-        bias, lean = rng.uniform(-0.5, 0.5), rng.normal(0, np.deg2rad(2.6), 2)
+        self.position_m = position_m = (START_M + np.pad(np.cumsum(np.concatenate(moves)), (1, 0)))[:n_frames]
+        frames, bias, lean = np.arange(n_frames), rng.uniform(-0.5, 0.5), rng.normal(0, np.deg2rad(2.6), 2)
 
         def noise(name: str, places: Array) -> Array:
             return smooth_line(stream(seed, f"{name} {date}"), places)
 
-        self._right = np.clip(bias + 0.6 * noise("right", position_m / 19), -WIDEST_M, WIDEST_M)
-        self._turn = lean[0] + np.deg2rad(6.0) * noise("turn", position_m / 11)
-        self._pitch = lean[1] * 0.2 + np.deg2rad(0.55) * noise("pitch", position_m / 2.3)
-        self._roll = np.deg2rad(0.5) * noise("roll", position_m / 3.1)
+        right = np.clip(bias + 0.6 * noise("right", position_m / 19), -WIDEST_M, WIDEST_M)
+        turn = lean[0] + np.deg2rad(6.0) * noise("turn", position_m / 11)
+        pitch = lean[1] * 0.2 + np.deg2rad(0.55) * noise("pitch", position_m / 2.3)
+        self._moves = (position_m, right, turn, pitch, np.deg2rad(0.5) * noise("roll", position_m / 3.1))
         self.sunniness, self.exposure = noise("cloud", frames / 17), np.exp(0.11 * noise("exposure", frames / 7))
 
     def poses(self, utime: NDArray[np.int64]) -> tuple[Array, ...]:
         """[n] route position, north, east, yaw, pitch and roll at [n] moments between the first and last picture."""
-        values = (self.position_m, self._right, self._turn, self._pitch, self._roll)
-        position, right, turn, pitch, roll = (np.interp(utime, self.utime, value) for value in values)
+        position, right, turn, pitch, roll = (np.interp(utime, self.utime, values) for values in self._moves)
         yaw = (self._route.heading(position) + turn + np.pi) % (2 * np.pi) - np.pi
         return position, *self._route.place(position, right).T, yaw, pitch, roll
 
@@ -149,10 +139,9 @@ class Drive:
             position, north, east, yaw, pitch, roll = self.poses(clock)
             rows = np.stack([clock, north, east, 0.4 * np.sin(position / 60), roll, pitch, yaw], axis=1)
             unknown = rng.random(len(rows)) < NAN_SHARE
-            burst = int(rng.integers(0, max(1, len(rows) - 10)))
-            unknown[burst : burst + int(rng.integers(2, 8))] = len(rows) > 20
-            if block == 0:
-                unknown[:NAN_FIRST] = len(rows) > 20
+            burst = rng.integers(0, max(1, len(rows) - 10))
+            unknown[burst : burst + rng.integers(2, 8)] = len(rows) > 20
+            unknown[: NAN_FIRST if block == 0 else 0] = len(rows) > 20
             rows[unknown, 1:] = np.nan
             yield rows
 

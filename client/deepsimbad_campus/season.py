@@ -1,65 +1,23 @@
 """How one drive looks: leaves, ground and sky by its season and date, and the daylight of its frames."""
 
 import datetime
-from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from deepsimbad_campus.camera import Array, Colour, Image, ink
+from deepsimbad_campus.camera import Array, Colour, Image
 from deepsimbad_campus.route import stream
 
 # The four recordings the paper uses.
 PAPER_DATES = {"winter": "2012-01-22", "spring": "2012-03-31", "summer": "2012-08-04", "autumn": "2012-11-17"}
+SHADES = np.arange(256)[None, :, None]  # what a look-up table is made of
 
 
 class CampusError(ValueError):
     """A campus that cannot be rendered as asked; the message is one sentence."""
 
     code = "invalid_campus"
-
-
-class Season(NamedTuple):
-    """The appearance of one drive."""
-
-    name: str
-    sun_azimuth_deg: float  # clockwise from north
-    sun_elevation_deg: float
-    sun_strength: float  # direct light on a surface that faces the sun
-    sun: Colour  # of direct light, 255 is neutral
-    ambient: Colour  # colour and strength of light from the sky
-    zenith: Colour
-    horizon: Colour  # sky low down, and haze
-    cloud_share: float
-    leaf_share: float  # how many leaves the trees hold
-    leaves: tuple[Colour, ...]  # colours they are drawn from
-    grass: Colour
-    snow: float  # how much of the ground is snow
-    litter: float  # how much of the ground fallen leaves cover
-    wet: float  # how dark paving is
-    haze_per_m: float  # share of a colour lost in a metre
-    exposure: float  # overall brightness
-
-
-SEASONS = (
-    Season(
-        "winter", 215, 17, 0.55, (205, 232, 255), (185, 172, 160), (190, 160, 130), (222, 218, 212), 0.55, 0.0,
-        ((70, 90, 110),), (62, 92, 104), 0.85, 0.05, 0.5, 0.0105, 1.0,
-    ),
-    Season(
-        "spring", 140, 38, 0.75, (235, 248, 255), (150, 146, 142), (205, 140, 72), (235, 218, 196), 0.35, 0.30,
-        ((70, 165, 140), (80, 180, 165), (150, 140, 205), (90, 150, 110)), (50, 122, 98), 0.0, 0.08, 0.25, 0.0024, 1.0,
-    ),
-    Season(
-        "summer", 185, 62, 0.9, (240, 252, 255), (132, 134, 136), (215, 138, 52), (238, 222, 190), 0.2, 1.0,
-        ((32, 92, 48), (36, 112, 62), (28, 78, 44), (44, 126, 80)), (46, 128, 92), 0.0, 0.0, 0.0, 0.0012, 1.0,
-    ),
-    Season(
-        "autumn", 243, 13, 0.7, (160, 214, 255), (172, 162, 152), (190, 145, 95), (205, 220, 235), 0.6, 0.42,
-        ((20, 110, 190), (30, 150, 215), (28, 70, 165), (40, 120, 140)), (48, 112, 112), 0.0, 0.6, 0.4, 0.0065, 0.92,
-    ),
-)  # fmt: skip
 
 
 def drive_date(season: str) -> datetime.date:
@@ -71,16 +29,34 @@ def drive_date(season: str) -> datetime.date:
         raise CampusError(f"season {season!r} is neither one of {names} nor a date like 2012-08-04") from cause
 
 
-def season_of(date: datetime.date, seed: int) -> Season:
-    """The appearance of a drive on a date: its season, with that day's own sun, cloud and exposure."""
-    season, rng = SEASONS[date.month % 12 // 3], stream(seed, f"weather {date}")
-    return season._replace(
-        sun_azimuth_deg=season.sun_azimuth_deg + rng.uniform(-15, 15),
-        sun_elevation_deg=season.sun_elevation_deg * rng.uniform(0.9, 1.1),
-        cloud_share=min(0.9, season.cloud_share * rng.uniform(0.7, 1.4)),
-        leaf_share=season.leaf_share * rng.uniform(0.85, 1.0),
-        exposure=season.exposure * rng.uniform(0.92, 1.08),
-    )
+class Season:
+    """How a drive on a date looks: its season's values (winter, spring, summer, autumn), varied by that day's own."""
+
+    def __init__(self, date: datetime.date, seed: int) -> None:
+        number, rng = date.month % 12 // 3, stream(seed, f"weather {date}")
+        self.name = tuple(PAPER_DATES)[number]
+        self.sun_azimuth_deg = (215, 140, 185, 243)[number] + rng.uniform(-15, 15)  # clockwise from north
+        self.sun_elevation_deg = (17, 38, 62, 13)[number] * rng.uniform(0.9, 1.1)
+        self.sun_strength = (0.55, 0.75, 0.9, 0.7)[number]  # direct light on a surface that faces the sun
+        self.sun = ((205, 232, 255), (235, 248, 255), (240, 252, 255), (160, 214, 255))[number]  # 255 is neutral
+        # Colour and strength of light from the sky; the sky's own colours high up and, as that of haze, low down.
+        self.ambient = ((185, 172, 160), (150, 146, 142), (132, 134, 136), (172, 162, 152))[number]
+        self.zenith = ((190, 160, 130), (205, 140, 72), (215, 138, 52), (190, 145, 95))[number]
+        self.horizon = ((222, 218, 212), (235, 218, 196), (238, 222, 190), (205, 220, 235))[number]
+        self.cloud_share = min(0.9, (0.55, 0.35, 0.2, 0.6)[number] * rng.uniform(0.7, 1.4))
+        self.leaf_share = (0.0, 0.30, 1.0, 0.42)[number] * rng.uniform(0.85, 1.0)  # how many leaves the trees hold
+        self.leaves: tuple[Colour, ...] = (  # colours they are drawn from
+            ((70, 90, 110),),
+            ((70, 165, 140), (80, 180, 165), (150, 140, 205), (90, 150, 110)),
+            ((32, 92, 48), (36, 112, 62), (28, 78, 44), (44, 126, 80)),
+            ((20, 110, 190), (30, 150, 215), (28, 70, 165), (40, 120, 140)),
+        )[number]
+        self.grass = ((62, 92, 104), (50, 122, 98), (46, 128, 92), (48, 112, 112))[number]
+        self.snow = (0.85, 0.0, 0.0, 0.0)[number]  # how much of the ground is snow
+        self.litter = (0.05, 0.08, 0.0, 0.6)[number]  # how much of the ground fallen leaves cover
+        self.wet = (0.5, 0.25, 0.0, 0.4)[number]  # how dark paving is
+        self.haze_per_m = (0.0105, 0.0024, 0.0012, 0.0065)[number]  # share of a colour lost in a metre
+        self.exposure = (1.0, 1.0, 1.0, 0.92)[number] * rng.uniform(0.92, 1.08)  # overall brightness
 
 
 class Light:
@@ -94,7 +70,6 @@ class Light:
         azimuth, elevation = np.deg2rad(season.sun_azimuth_deg), np.deg2rad(season.sun_elevation_deg)
         flat = np.cos(elevation)
         self.sun = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))  # unit vector: north, east, up
-        self.on_ground, self.in_shade = self.gain(self.sun[2]), self.gain(0.0)
         self.air = np.array(season.horizon) * exposure  # [3] what haze looks like
 
     def gain(self, towards_sun: float) -> Array:
@@ -104,23 +79,19 @@ class Light:
         sky = np.array(season.ambient) / 255 * (1.12 - 0.12 * self.sunshine)  # under cloud the sky itself is brighter
         return np.asarray((sky + direct * np.array(season.sun) / 255) * (season.exposure * self.exposure), np.float64)
 
-    def between(self, share: float) -> Array:
-        """[3] factor for what is partly in the sun."""
-        return np.asarray(self.in_shade + share * (self.on_ground - self.in_shade), np.float64)
+    def on_ground(self, share: float) -> Array:
+        """[3] factor for the ground, or what stands on it, where so much of it is in the sun."""
+        return self.gain(share * self.sun[2])
 
     def haze(self, distance_m: float) -> float:
         """Share of a colour that haze has taken at a distance, 0..1."""
         return 1.0 - float(np.exp(-self.season.haze_per_m * distance_m))
 
-    def colour(self, colour: Colour, gain: Array, distance_m: float) -> tuple[int, ...]:
-        """A surface's colour as the camera sees it at a distance."""
-        return ink(self._apparent_colour(np.array(colour), gain, distance_m))
+    def seen(self, colours: ArrayLike, gain: Array, distance_m: float) -> Image:
+        """[..., 3] the colours at a distance of surfaces of [..., 3] own colours, or of [..., 1] greys."""
+        share = self.haze(distance_m)
+        return np.clip(np.multiply(colours, gain) * (1 - share) + self.air * share, 0, 255).astype(np.uint8)
 
     def shine_on(self, picture: Image, gain: Array, distance_m: float) -> Image:
         """A picture of a surface's own colours as the camera sees it at a distance."""
-        table = np.clip(self._apparent_colour(np.arange(256)[:, None], gain, distance_m), 0, 255)
-        return np.asarray(cv2.LUT(picture, table.astype(np.uint8)[None]), np.uint8)
-
-    def _apparent_colour(self, colour: NDArray[Any], gain: Array, distance_m: float) -> Array:
-        share = self.haze(distance_m)
-        return np.asarray(colour * gain * (1 - share) + self.air * share, np.float64)
+        return np.asarray(cv2.LUT(picture, self.seen(SHADES, gain, distance_m)), np.uint8)

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 
 from deepsimbad_campus import camera
-from deepsimbad_campus.camera import FOCAL_PX, HEIGHT, NEAR_M, WIDTH, Array, Colour, Image, View, project, sixteenths
-from deepsimbad_campus.pictures import TREE_HEIGHT, TREE_WIDTH
+from deepsimbad_campus.camera import FOCAL_PX, HALF_VIEW, NEAR_M, Array, Colour, Image, View, project, sixteenths
+from deepsimbad_campus.pictures import TREE_HEIGHT, TREE_WIDTH, Levels
 from deepsimbad_campus.route import INTERVAL_US, START_M, Drive, Route, stream
-from deepsimbad_campus.season import Light
-from deepsimbad_campus.world import SIGHT_M, SIGNS, Section, Style, Thing, World
+from deepsimbad_campus.season import SHADES, Light
+from deepsimbad_campus.world import SIGHT_M, SIGNS, Section, Thing, World
 
 CELL_M = 18.0  # people come in groups, one group or none for every so many metres of route
 PARKED_SHARE, PEOPLE_SHARE = 0.6, 0.8
@@ -38,35 +38,36 @@ class Shot(NamedTuple):
     view: View
     light: Light
     position_m: float = 0.0  # along the route
-    trees: Sequence[Sequence[Image]] = ()  # pictures of every species and their halvings
+    sections: Sequence[Section] = ()  # in sight, nearest first
+    trees: Sequence[Levels] = ()  # every species
 
 
 def around(world: World, drive: Drive, frame: int) -> Iterator[Thing]:
     """The things that stand or move in sight of a frame, without walls."""
     position_m, time_s = drive.position_m[frame], int(drive.utime[frame] - drive.utime[0]) / 1e6
     for section in world.ahead(position_m):
-        yield from section.things
-        yield from _cars(section, drive, world.route, time_s)
+        for thing in section.things:
+            if thing.kind != "bay":
+                yield thing
+                continue
+            rng = stream(drive.seed, f"bay {drive.date}", thing.look)
+            if rng.random() < PARKED_SHARE:
+                turn = rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
+                yield Thing(thing.place, "car", 1.5, int(rng.integers(0, len(CARS))), thing.turn + turn)
+        if section.road_right_m is not None:
+            yield from _traffic(section, section.road_right_m, drive, world.route, time_s)
     yield from _people(drive, world.route, position_m, time_s)
 
 
-def _cars(section: Section, drive: Drive, route: Route, time_s: float) -> Iterator[Thing]:
-    """The cars that stand in a section's bays during a drive, and those on its road."""
-    for place, heading, number in section.bays:
-        rng = stream(drive.seed, f"bay {drive.date}", number)
-        if rng.random() < PARKED_SHARE:
-            turn = rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
-            yield Thing(place, "car", 1.5, int(rng.integers(0, len(CARS))), heading + turn)
-    if section.road_right_m is not None:
-        rng = stream(drive.seed, f"traffic {drive.date}", section.stretch.number)
-        for _ in range(rng.integers(1, 4)):
-            speed = rng.uniform(6, 11) * rng.choice([-1, 1])
-            loop_m = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M
-            paint = int(rng.integers(0, len(CARS)))
-            if loop_m <= section.stretch.straight_m:
-                position_m, right_m = section.stretch.start_m + loop_m, section.road_right_m + np.sign(speed) * LANE_M
-                turn = float(route.heading(position_m)) + (np.pi if speed < 0 else 0.0)
-                yield Thing(route.place(position_m, right_m), "car", 1.5, paint, turn)
+def _traffic(section: Section, road_right_m: float, drive: Drive, route: Route, time_s: float) -> Iterator[Thing]:
+    rng = stream(drive.seed, f"traffic {drive.date}", section.stretch.number)
+    for _ in range(rng.integers(1, 4)):
+        speed = rng.uniform(6, 11) * rng.choice([-1, 1])
+        loop_m, paint = (rng.uniform(0, LOOP_M) + speed * time_s) % LOOP_M, int(rng.integers(0, len(CARS)))
+        if loop_m <= section.stretch.straight_m:
+            position_m = section.stretch.start_m + loop_m
+            place = route.place(position_m, road_right_m + np.sign(speed) * LANE_M)
+            yield Thing(place, "car", 1.5, paint, float(route.heading(position_m)) + (np.pi if speed < 0 else 0.0))
 
 
 def _people(drive: Drive, route: Route, position_m: float, time_s: float) -> Iterator[Thing]:
@@ -84,11 +85,11 @@ def _people(drive: Drive, route: Route, position_m: float, time_s: float) -> Ite
                     yield Thing(route.place(walker_m, right_m), "person", 1.75, look, 2.2 * walker_m if speed else 0.4)
 
 
-def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
+def panels(feet: Array, view: View) -> Iterator[tuple[Array, Array]]:
     """Cut the part of a wall that is in view into panels short enough to be sorted by distance.
 
-    Yields of each panel its distance ahead in metres, [2, 2] (right, ahead) of its left and right foot, and [2] where
-    these lie along the wall, 0 its left and 1 its right edge.
+    Yields of each [2, 2] (right, ahead) of its left and right foot, and [2] where these lie along the wall, 0 its left
+    and 1 its right edge.
     """
     (x0, z0), (x1, z1) = ends = view.to_camera(feet)
     if x1 * z0 - x0 * z1 <= 0 or max(z0, z1) < NEAR_M or min(z0, z1) > SIGHT_M:
@@ -97,55 +98,52 @@ def panels(feet: Array, view: View) -> Iterator[tuple[float, Array, Array]]:
     length, near = (last - first) * np.hypot(x1 - x0, z1 - z0), max(NEAR_M, min(z0, z1))
     cuts = np.linspace(first, last, int(np.ceil(length / max(5.0, 0.4 * near))) + 1)
     feet = ends[0] + cuts[:, None] * (ends[1] - ends[0])
-    ahead = np.maximum(feet[:, 1], 1e-3)
-    slope = feet[:, 0] / ahead
-    for k in np.flatnonzero((slope[:-1] < camera.HALF_VIEW) & (slope[1:] > -camera.HALF_VIEW)):
-        yield (ahead[k] + ahead[k + 1]) / 2, feet[k : k + 2], cuts[k : k + 2]
+    slope = feet[:, 0] / feet[:, 1]
+    for k in np.flatnonzero((slope[:-1] < HALF_VIEW) & (slope[1:] > -HALF_VIEW)):
+        yield feet[k : k + 2], cuts[k : k + 2]
 
 
-def draw_panel(
-    shot: Shot, facade: Callable[[Style], Sequence[Image]], style: Style, gain: Array, feet: Array, span: Array
-) -> None:
-    """Draw one panel of a wall; `facade` gives the wall's picture and its halvings."""
-    levels, low, high = facade(style), project(feet), project(feet, style.height_m)
-    tall = max(1.0, (low - high)[:, 1].max())
-    level = int(np.clip(np.log2(max(levels[0].shape[0] / tall, 1.0)), 0, len(levels) - 1))
-    height, width = levels[level].shape[:2]
+def _level(levels: Levels, reduction: float) -> Image:
+    return levels[int(min(np.log2(max(1.0, reduction)), len(levels) - 1))]
+
+
+def draw_panel(shot: Shot, levels: Levels, height_m: float, gain: Array, feet: Array, span: Array) -> None:
+    """Draw one panel of a wall."""
+    low, high = project(feet), project(feet, height_m)
+    level = _level(levels, len(levels[0]) / max(1.0, (low - high)[:, 1].max()))
+    height, width = level.shape[:2]
     outline = np.stack([high[0], high[1], low[1], low[0]])
-    left, top = np.maximum(0, outline.min(0).astype(int) - (2, 1))
-    right, bottom = np.minimum((WIDTH, HEIGHT), outline.max(0).astype(int) - (-3, -2))
-    if left >= right or top >= bottom:
+    (left, top), roi = camera.window(
+        shot.canvas, outline.min(0).astype(int) - (2, 1), outline.max(0).astype(int) - (-3, -2)
+    )
+    if not roi.size:
         return
     first, last = max(0, int(span[0] * width) - 1), min(width, int(np.ceil(span[1] * width)) + 1)
-    part = shot.light.shine_on(np.ascontiguousarray(levels[level][:, first:last]), gain, feet[:, 1].mean())
+    part = shot.light.shine_on(np.ascontiguousarray(level[:, first:last]), gain, feet[:, 1].mean())
     u0, u1 = span * width - first - 0.5
     source = np.array([(u0, -0.5), (u1, -0.5), (u1, height - 0.5), (u0, height - 0.5)], np.float32)
     bend = cv2.getPerspectiveTransform(source, (outline - (left, top)).astype(np.float32))
-    roi, size = shot.canvas[top:bottom, left:right], (int(right - left), int(bottom - top))
-    cv2.warpPerspective(part, bend, size, dst=roi, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_TRANSPARENT)
+    cv2.warpPerspective(part, bend, roi.shape[1::-1], roi, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
 
 
 def _draw_tree(shot: Shot, tree: Thing, foot: Array) -> None:
     (x, y), ahead, light, levels = project(foot), foot[1], shot.light, shot.trees[tree.look]
     tall = FOCAL_PX * tree.size_m / ahead
-    scale = tall / TREE_HEIGHT
-    wide = TREE_WIDTH * scale
-    left, right = max(0, int(x - wide / 2)), min(WIDTH, int(x + wide / 2) + 1)
-    top, bottom = max(0, int(y - tall)), min(HEIGHT, int(y) + 1)
-    if left >= right or top >= bottom:
+    wide = TREE_WIDTH * tall / TREE_HEIGHT
+    (left, top), roi = camera.window(shot.canvas, (x - wide / 2, y - tall), (int(x + wide / 2) + 1, int(y) + 1))
+    if not roi.size:
         return
-    picture = levels[int(np.clip(np.log2(max(1.0, 1 / scale)), 0, len(levels) - 1))]
+    picture = _level(levels, TREE_HEIGHT / tall)
     grow_x, grow_y = wide / picture.shape[1], tall / picture.shape[0]
     place = np.array([[tree.turn * grow_x, 0, x - tree.turn * wide / 2 - left], [0, grow_y, y - tall - top]])
-    part = cv2.warpAffine(picture, place, (right - left, bottom - top), flags=cv2.INTER_LINEAR)
+    part = cv2.warpAffine(picture, place, roi.shape[1::-1], flags=cv2.INTER_LINEAR)
     colour, alpha = cv2.cvtColor(part, cv2.COLOR_BGRA2BGR), cv2.merge([part[:, :, 3]] * 3)
-    share, shades = light.haze(ahead), np.arange(256)[:, None]
-    lit = np.clip(shades * light.between(0.55) * (1 - share), 0, 255).astype(np.uint8)[None]
+    share = light.haze(ahead)
+    lit = np.clip(SHADES * light.on_ground(0.55) * (1 - share), 0, 255).astype(np.uint8)
     colour = cv2.LUT(colour, lit)
     if share > 0.03:
-        hazy = np.clip(shades * light.air / 255 * share, 0, 255).astype(np.uint8)[None]
+        hazy = np.clip(SHADES * light.air / 255 * share, 0, 255).astype(np.uint8)
         cv2.add(colour, cv2.LUT(alpha, hazy), dst=colour)
-    roi = shot.canvas[top:bottom, left:right]
     cv2.multiply(roi, cv2.bitwise_not(alpha), dst=roi, scale=1 / 255)
     cv2.add(roi, colour, dst=roi)
 
@@ -158,12 +156,11 @@ def _draw_car(shot: Shot, car: Thing, centre: Array) -> None:
     nose, side = np.array([np.sin(turn), np.cos(turn)]), np.array([np.cos(turn), -np.sin(turn)])
 
     def face(ground: Array, heights: Array, colour: Colour, gain: Array) -> None:
-        ink = light.colour(colour, gain, distance)
+        ink = light.seen(colour, gain, distance).tolist()
         cv2.fillPoly(shot.canvas, [sixteenths(project(ground, heights))], ink, cv2.LINE_AA, 4)
 
-    shadow = np.stack([centre + nose * a + side * b for a, b in ((-2.3, -1), (2.3, -1), (2.3, 1), (-2.3, 1))])
-    face(shadow, np.zeros(4), (46, 46, 48), light.in_shade)
-    base = light.between(0.45)
+    shadow, base = np.array([(-2.3, -1), (2.3, -1), (2.3, 1), (-2.3, 1)]), light.on_ground(0.45)
+    face(centre + shadow @ np.stack([nose, side]), np.zeros(4), (46, 46, 48), light.gain(0))
     for (forward, up), colour in ((BODY, paint), (CABIN, GLASS)):
         feet = centre + forward[:, None] * nose
         left, right = feet - HALF_WIDTH_M * side, feet + HALF_WIDTH_M * side
@@ -176,24 +173,23 @@ def _draw_car(shot: Shot, car: Thing, centre: Array) -> None:
     near, ring = -1.0 if centre @ side > 0 else 1.0, np.linspace(0, 2 * np.pi, 14, endpoint=False)
     for axle_m in (-1.35, 1.35) if distance < 45 else ():
         hub = centre + nose * axle_m + side * near * HALF_WIDTH_M
-        face(hub + nose * 0.33 * np.cos(ring)[:, None], 0.33 + 0.33 * np.sin(ring), (24, 24, 26), light.in_shade)
+        face(hub + nose * 0.33 * np.cos(ring)[:, None], 0.33 + 0.33 * np.sin(ring), (24, 24, 26), light.gain(0))
 
 
 def _draw_person(shot: Shot, walker: Thing, foot: Array) -> None:
-    ahead = foot[1]
-    if ahead < 0.9:
+    if foot[1] < 0.9:
         return
-    rng, swing, gain = np.random.default_rng(walker.look), 0.16 * np.sin(walker.turn), shot.light.between(0.5)
-    unit = FOCAL_PX / ahead * rng.uniform(1.58, 1.9) / 1.75
-    coat = COATS[rng.integers(0, len(COATS))]
+    rng, swing, gain = np.random.default_rng(walker.look), 0.16 * np.sin(walker.turn), shot.light.on_ground(0.5)
+    unit, coat = FOCAL_PX / foot[1] * rng.uniform(1.58, 1.9) / 1.75, COATS[rng.integers(0, len(COATS))]
     legs = (70, 52, 40) if rng.random() < 0.6 else (44, 44, 46)
-    arms = ((-0.33, -0.22, 0.8 + swing, 1.42, coat), (0.22, 0.33, 0.8 - swing, 1.42, coat))
-    feet = ((-0.14 - swing, 0.0 - swing, 0.0, 0.85, legs), (0.0 + swing, 0.14 + swing, 0.0, 0.85, legs))
-    x, y = _draw_boxes(shot, (*feet, (-0.25, 0.25, 0.78, 1.46, coat), *arms), foot, unit, gain, taper=0.9)
-    (x, y), face_y = (round(x), round(y - 1.6 * unit)), round(y - 1.6 * unit) + round(0.03 * unit)
-    for colour, centre, size in (((38, 46, 60), (x, y), 0.13), ((120, 150, 196), (x, face_y), 0.1)):
-        ink = shot.light.colour(colour, gain, ahead)
-        cv2.circle(shot.canvas, centre, max(1, round(size * unit)), ink, -1, cv2.LINE_AA)
+    feet: list[Box] = [(-0.14 - swing, -swing, 0.0, 0.85, legs), (swing, 0.14 + swing, 0.0, 0.85, legs)]
+    arms: list[Box] = [(-0.33, -0.22, 0.8 + swing, 1.42, coat), (0.22, 0.33, 0.8 - swing, 1.42, coat)]
+    _draw_boxes(shot, [*feet, (-0.25, 0.25, 0.78, 1.46, coat), *arms], foot, unit, gain, taper=0.9)
+    x, y = np.round(project(foot) - (0, 1.6 * unit)).astype(int).tolist()
+    for colour, drop_m, size_m in (((38, 46, 60), 0.0, 0.13), ((120, 150, 196), 0.03, 0.1)):  # hair and face
+        ink = shot.light.seen(colour, gain, foot[1]).tolist()
+        centre, radius = (x, y + round(drop_m * unit)), max(1, round(size_m * unit))
+        cv2.circle(shot.canvas, centre, radius, ink, -1, cv2.LINE_AA)
 
 
 def _draw_post(shot: Shot, post: Thing, foot: Array) -> None:
@@ -210,17 +206,15 @@ def _draw_post(shot: Shot, post: Thing, foot: Array) -> None:
         boxes = [(-0.04, 0.04, 0, size, METAL), (-0.38, 0.38, size - 0.75, size, SIGNS[post.kind])]
         boxes += [(-0.28, 0.28, size - 0.45, size - 0.32, (230, 230, 230))]
     if foot[1] >= 0.8:
-        _draw_boxes(shot, boxes, foot, FOCAL_PX / foot[1], shot.light.between(0.4))
+        _draw_boxes(shot, boxes, foot, FOCAL_PX / foot[1], shot.light.on_ground(0.4))
 
 
-def _draw_boxes(shot: Shot, boxes: Sequence[Box], foot: Array, unit: float, gain: Array, taper: float = 1.0) -> Array:
-    """Draw upright boxes around a foot, so many pixels a metre; returns the foot's pixel."""
-    pixel = project(foot)
+def _draw_boxes(shot: Shot, boxes: Sequence[Box], foot: Array, unit: float, gain: Array, taper: float = 1.0) -> None:
+    """Draw upright boxes around a foot, so many pixels a metre."""
     for left, right, low, high, colour in boxes:
         corners = np.array([(left, low), (right, low), (right * taper, high), (left * taper, high)])
-        ink = shot.light.colour(colour, gain, foot[1])
-        cv2.fillConvexPoly(shot.canvas, sixteenths(pixel + corners * (unit, -unit)), ink, cv2.LINE_AA, 4)
-    return pixel
+        ink = shot.light.seen(colour, gain, foot[1]).tolist()
+        cv2.fillConvexPoly(shot.canvas, sixteenths(project(foot) + corners * (unit, -unit)), ink, cv2.LINE_AA, 4)
 
 
 class Kind(NamedTuple):
@@ -228,20 +222,15 @@ class Kind(NamedTuple):
 
     draw: Callable[[Shot, Thing, Array], None]
     margin_m: float  # how far beside the view it may stand and still reach into it
-    half_m: tuple[float, float]  # half its width: metres, and share of its size
-    height_m: tuple[float, float] = (0, 1)  # its height: metres, and share of its size
-
-    def measures(self, size_m: float) -> tuple[float, float]:
-        """Metres of half its width and of its height."""
-        return self.half_m[0] + self.half_m[1] * size_m, self.height_m[0] + self.height_m[1] * size_m
+    sides: tuple[tuple[float, float], tuple[float, float]]  # half its width, its height: metres, and share of its size
 
 
 KINDS = {
-    **dict.fromkeys(("tree", "conifer", "bush"), Kind(_draw_tree, 5.0, (0, 0.35))),
-    **dict.fromkeys(SIGNS, Kind(_draw_post, 1.5, (0.38, 0))),
-    "lamp": Kind(_draw_post, 1.5, (0.26, 0), (0.5, 1)),
-    "bollard": Kind(_draw_post, 1.5, (0.1, 0)),
-    "bench": Kind(_draw_post, 1.5, (0, 0.5), (0.88, 0)),
-    "car": Kind(_draw_car, 3.0, (1.7, 0)),
-    "person": Kind(_draw_person, 1.0, (0.3, 0)),
+    **dict.fromkeys(("tree", "conifer", "bush"), Kind(_draw_tree, 5.0, ((0, 0.35), (0, 1)))),
+    **dict.fromkeys(SIGNS, Kind(_draw_post, 1.5, ((0.38, 0), (0, 1)))),
+    "lamp": Kind(_draw_post, 1.5, ((0.26, 0), (0.5, 1))),
+    "bollard": Kind(_draw_post, 1.5, ((0.1, 0), (0, 1))),
+    "bench": Kind(_draw_post, 1.5, ((0, 0.5), (0.88, 0))),
+    "car": Kind(_draw_car, 3.0, ((1.7, 0), (0, 1))),
+    "person": Kind(_draw_person, 1.0, ((0.3, 0), (0, 1))),
 }

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepsimbad_campus.camera import Array, Colour
-from deepsimbad_campus.route import Route, Stretch, stream
+from deepsimbad_campus.route import STEP_M, Route, Stretch, stream
 
 SIGHT_M, BEHIND_M = 130.0, 25.0  # nothing farther along the route than this is drawn
 NEIGHBOURS = 24  # the buildings last placed, which a new one must not meet
@@ -21,8 +21,6 @@ SIGNS: dict[str, Colour] = {
 }  # fmt: skip
 SIZES_M = {"lamp": 5.0, "sign": 2.3, "bollard": 0.9, "bench": 1.6, "bush": 1.3}  # on average
 
-Bay = tuple[Array, float, int]  # where a car may stand, its heading in radians, a number of the bay
-
 
 class Thing(NamedTuple):
     """Something on the ground that shows the camera one face, wherever it is seen from."""
@@ -30,8 +28,8 @@ class Thing(NamedTuple):
     place: Array
     kind: str
     size_m: float  # height; of a bench its length
-    look: int = 0  # a tree's species, a car's paint, seed of a walker's clothes
-    turn: float = 0.0  # a car's heading, a walker's stride; -1 of a mirrored tree
+    look: int  # a tree's species, a car's paint, seed of a walker's clothes, number of a bay where a car may stand
+    turn: float  # heading of a car or a bay, a walker's stride; -1 of a mirrored tree
 
 
 class Style(NamedTuple):
@@ -41,9 +39,7 @@ class Style(NamedTuple):
     material: str
     width_m: float
     height_m: float
-    floors: int  # 0: a plain wall without windows
-    bay_m: float  # between two windows
-    door: bool
+    door: bool = False
 
 
 class Block(NamedTuple):
@@ -78,31 +74,29 @@ class Section:
     Nothing may stand on the route, nor on `placed_blocks`, all buildings so far, to which it adds its own.
     """
 
-    def __init__(
-        self, route: Route, stretch: Stretch, zone: str, rng: np.random.Generator, placed_blocks: list[Block]
-    ) -> None:
-        self.stretch, self._rng, self._placed_blocks = stretch, rng, placed_blocks
+    def __init__(self, seed: int, route: Route, stretch: Stretch, placed_blocks: list[Block]) -> None:
+        self.stretch, self._placed_blocks = stretch, placed_blocks
         self.blocks: list[Block] = []
         self.facades: list[tuple[Array, Style]] = []  # [2, 2] feet of a wall's left and right edge, seen from outside
         self.things: list[Thing] = []
-        self.bays: list[Bay] = []
         self.patches: list[tuple[Array, str]] = []  # [4, 2] a paved piece of ground, and with what
         self.road_right_m: float | None = None
-        start = stretch.start_m + 0.25
-        self.heading_rad = heading = float(route.heading(start))
-        self._origin = route.place(start)
-        self._axes = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
-        self._line = route.between(stretch.start_m - 160, stretch.end_m + 160)
+        self._origin, self._heading_rad = route.place(stretch.start_m + 0.25), route.heading(stretch.start_m + 0.25)
+        cos, sin = np.cos(self._heading_rad), np.sin(self._heading_rad)
+        self._axes = np.array([[cos, sin], [-sin, cos]])
+        self._line = route.place(np.arange(stretch.start_m - 160, stretch.end_m + 160 + STEP_M, STEP_M))
+        self._rng = rng = stream(seed, "stretch", stretch.number)
         self.path_half_width_m = rng.uniform(1.3, 2.2)
         self.path_surface = ("concrete", "asphalt", "paving")[rng.integers(0, 3)]
-        length = stretch.straight_m
+        deck, card = divmod(stretch.number, len(DECK))
+        zone, length = stream(seed, "deck", deck).permutation(DECK)[card], stretch.straight_m
         getattr(self, f"_{zone}")(rng, length)
         # What every stretch has: distant buildings and bushes, trees at its bend, perhaps a crossing path.
         if zone not in ("field", "wall"):
             self._row(-1 if rng.random() < 0.5 else 1, (45, 70), 0.5, (9, 26))
             self._posts("bush", int(rng.integers(1, 5)))
         for _ in range(rng.integers(2, 6)):
-            self._tree(rng.uniform(length, length + stretch.bend_m), rng.uniform(-25, 25), clearance=4.5)
+            self._tree(rng.uniform(length, stretch.end_m - stretch.start_m), rng.uniform(-25, 25), room=4.5)
         if rng.random() < 0.6:
             along_m = rng.uniform(0.2, 0.8) * length
             self._pave(along_m, along_m + rng.uniform(1.6, 4), -40, 40, "concrete")
@@ -110,28 +104,25 @@ class Section:
     def _point(self, along_m: float, right_m: float) -> Array:
         return np.asarray(self._origin + along_m * self._axes[0] + right_m * self._axes[1], np.float64)
 
-    def _free(self, place: Array, clearance: float) -> bool:
-        on_route = np.hypot(*(self._line - place).T).min() < clearance
-        return not (on_route or any(block.contains(place[None], 1.0)[0] for block in self._placed_blocks[-NEIGHBOURS:]))
+    def _put(self, thing: Thing, clearance: float) -> None:
+        """Add a thing where it stands free of the route and of buildings."""
+        on_route = np.hypot(*(self._line - thing.place).T).min() < clearance
+        near = self._placed_blocks[-NEIGHBOURS:]
+        if not (on_route or any(block.contains(thing.place[None], 1.0)[0] for block in near)):
+            self.things.append(thing)
 
-    def _build(
-        self, along_m: float, setback: float, size: tuple[float, ...], material: str, seed: int, clearance: float = 4.0
-    ) -> None:
-        """Put up a building of (width, depth, height), if it fits, by its near end and near face (negative is left)."""
-        width, depth, height = size
-        centre = self._point(along_m + width / 2, setback + np.copysign(depth / 2, setback))
-        block = Block(centre, self._axes, (width / 2, depth / 2), height)
+    def _build(self, along_m: float, setback: float, depth: float, style: Style, clearance: float = 4.0) -> None:
+        """Put up a building with such a front, if it fits, by its near end and near face (negative is left)."""
+        centre = self._point(along_m + style.width_m / 2, setback + np.copysign(depth / 2, setback))
+        block = Block(centre, self._axes, (style.width_m / 2, depth / 2), style.height_m)
         if block.contains(self._line, clearance).any() or any(map(block.meets, self._placed_blocks[-NEIGHBOURS:])):
             return
         self._placed_blocks.append(block)
         self.blocks.append(block)
-        details, corners = np.random.default_rng([seed, 7]), block.corners()
-        floors = 0 if material == "wall" else max(1, int(height / details.uniform(3.1, 3.9)))
-        bay = details.uniform(2.2, 4.2)
-        for edge in range(4):
-            feet, door = corners[[edge, (edge + 1) % 4]], edge == (0 if setback > 0 else 2)
+        corners, front = block.corners(), 0 if setback > 0 else 2
+        for edge, feet in enumerate(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)):
             wide = round(float(np.hypot(*(feet[1] - feet[0]))), 2)
-            self.facades.append((feet, Style(seed, material, wide, height, floors, bay, door)))
+            self.facades.append((feet, style._replace(width_m=wide, door=edge == front)))
 
     def _row(self, side: float, setbacks: tuple[float, float], share: float, heights: tuple[float, float]) -> None:
         """Line one side with buildings and gaps."""
@@ -142,17 +133,16 @@ class Section:
                 setback = side * rng.uniform(*setbacks)
                 width, depth, height = rng.uniform(9, 24), rng.uniform(9, 18), rng.uniform(*heights)
                 material = MATERIALS[rng.integers(0, len(MATERIALS))]
-                self._build(along_m, setback, (width, depth, height), material, int(rng.integers(0, 1 << 31)))
+                self._build(along_m, setback, depth, Style(int(rng.integers(0, 1 << 31)), material, width, height))
             along_m = along_m + width + rng.uniform(2, 9)
 
-    def _tree(
-        self, along_m: float, right_m: float, species: int = -1, clearance: float = 3.0, height: float = 0.0
-    ) -> None:
+    def _tree(self, along_m: float, right_m: float, species: int = -1, height: float = 0.0, room: float = 3.0) -> None:
         """Plant a tree, if there is room, of any species and height where none is given."""
-        place, rng = self._point(along_m, right_m), self._rng
+        rng = self._rng
         species = int(rng.integers(0, BUSH)) if species < 0 else species
         kind, height = "conifer" if species >= FIRST_CONIFER else "tree", height or rng.uniform(6, 13)
-        self._put(Thing(place, kind, height, species, -1.0 if rng.random() < 0.5 else 1.0), clearance)
+        mirror = -1.0 if rng.random() < 0.5 else 1.0
+        self._put(Thing(self._point(along_m, right_m), kind, height, species, mirror), room)
 
     def _posts(self, kind: str, count: int = 1, at_m: float | None = None) -> None:
         """Put posts or bushes beside the path, where there is room, anywhere along it where no place is given."""
@@ -163,14 +153,9 @@ class Section:
             sign, size = list(SIGNS)[rng.integers(0, len(SIGNS))], SIZES_M[kind] * rng.uniform(0.8, 1.3)
             self._put(Thing(place, sign if kind == "sign" else kind, size, BUSH, 1.0), 2.5)
 
-    def _put(self, thing: Thing, clearance: float) -> None:
-        if self._free(thing.place, clearance):
-            self.things.append(thing)
-
     def _bay(self, along_m: float, right_m: float, turn: float = 0.0) -> None:
-        place = self._point(along_m, right_m)
-        if self._free(place, 3.2):
-            self.bays.append((place, self.heading_rad + turn, self.stretch.number * BAY_NUMBERS + len(self.bays)))
+        number = self.stretch.number * BAY_NUMBERS + sum(thing.kind == "bay" for thing in self.things)
+        self._put(Thing(self._point(along_m, right_m), "bay", 0.0, number, float(self._heading_rad) + turn), 3.2)
 
     def _pave(self, first: float, last: float, left: float, right: float, surface: str) -> None:
         corners = ((first, left), (last, left), (last, right), (first, right))
@@ -203,7 +188,7 @@ class Section:
         for along_m in np.arange(2.0, length, rng.uniform(7, 10)):
             for side in (-1, 1):
                 height = rng.uniform(9, 11)
-                self._tree(along_m, side * rng.uniform(4.2, 4.8), species, height=height)
+                self._tree(along_m, side * rng.uniform(4.2, 4.8), species, height)
         for side in (-1, 1):
             self._row(side, (18, 30), 0.35, (6, 15))
         self._posts("bench", 2)
@@ -211,11 +196,11 @@ class Section:
     def _twins(self, rng: np.random.Generator, length: float) -> None:
         """Buildings that look alike: places that are hard to tell apart."""
         seed, width, gap = int(rng.integers(0, 1 << 31)), rng.uniform(10, 13), rng.uniform(2, 4)
-        size, material = (round(width, 2), 11.0, rng.uniform(7, 11)), MATERIALS[rng.integers(0, len(MATERIALS))]
+        height, material = rng.uniform(7, 11), MATERIALS[rng.integers(0, len(MATERIALS))]
         for side in (-1, 1):
             for along_m in np.arange(1.0, length - width + 2, width + gap):
-                self._build(along_m, side * 8.5, size, material, seed)
-                self._tree(along_m + width + gap / 2, side * 5.5, seed % 10, height=6.5)
+                self._build(along_m, side * 8.5, 11.0, Style(seed, material, round(width, 2), height))
+                self._tree(along_m + width + gap / 2, side * 5.5, seed % 10, 6.5)
 
     def _field(self, rng: np.random.Generator, length: float) -> None:
         """Hardly anything: places without a landmark."""
@@ -227,8 +212,8 @@ class Section:
         self._posts("bench")
 
     def _wall(self, rng: np.random.Generator, length: float) -> None:
-        side, size = rng.choice([-1, 1]), (length - 1, 0.4, rng.uniform(2.4, 3.4))
-        self._build(0.5, side * 4.2, size, "wall", int(rng.integers(0, 1 << 31)), clearance=3.0)
+        side, height = rng.choice([-1, 1]), rng.uniform(2.4, 3.4)
+        self._build(0.5, side * 4.2, 0.4, Style(int(rng.integers(0, 1 << 31)), "wall", length - 1, height), 3.0)
         for along_m in np.arange(0.0, length, rng.uniform(8, 14)):
             self._tree(along_m, side * rng.uniform(8, 20))
         for _ in range(3):
@@ -254,13 +239,9 @@ class World:
         self.seed = seed
         # A stretch is furnished knowing the route well beyond it, so the route goes on past the last of them.
         self.route = Route(seed, length_m + 2 * SIGHT_M + 400)
-        self.sections: list[Section] = []
-        blocks: list[Block] = []
-        for index, stretch in enumerate(self.route.stretches):
-            if stretch.start_m <= length_m + SIGHT_M:
-                deck = stream(seed, "deck", index // len(DECK)).permutation(DECK)
-                zone, rng = deck[index % len(DECK)], stream(seed, "stretch", index)
-                self.sections.append(Section(self.route, stretch, zone, rng, blocks))
+        stretches, blocks = self.route.stretches, list[Block]()
+        near = [stretch for stretch in stretches if stretch.start_m <= length_m + SIGHT_M]
+        self.sections = [Section(seed, self.route, stretch, blocks) for stretch in near]
         self._starts = np.array([section.stretch.start_m for section in self.sections])
 
     def ahead(self, position_m: float) -> list[Section]:

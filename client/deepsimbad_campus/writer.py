@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deepsimbad_campus.observer import CAPTIONS, DETECTIONS, Observer
+from deepsimbad_campus.observer import CAPTIONS, DETECTIONS, observe
 from deepsimbad_campus.renderer import Renderer
 from deepsimbad_campus.route import Drive, drive_length_m
 from deepsimbad_campus.season import PAPER_DATES, CampusError, drive_date
@@ -83,7 +83,7 @@ def _write_drive(root: Path, world: World, drive: Drive) -> Iterator[None]:
         partial_file.unlink(missing_ok=True)
     missing = [frame for frame, file in enumerate(files) if not file.exists()]
     if missing or not (folder / CAPTIONS).exists():
-        bodies = Observer(world, drive).files([file.name for file in files])
+        bodies = observe(world, drive, [file.name for file in files])
         for name, body in zip((DETECTIONS, CAPTIONS), bodies, strict=True):
             _replace(folder / name, body)
     yield from [None] * (len(files) - len(missing))

@@ -9,7 +9,7 @@ from deepsimbad_campus.camera import HEIGHT, WIDTH, View, clip_near, project
 from deepsimbad_campus.pictures import draw_facade, draw_trees
 from deepsimbad_campus.renderer import Renderer
 from deepsimbad_campus.route import Drive, drive_length_m
-from deepsimbad_campus.season import PAPER_DATES, Light, drive_date, season_of
+from deepsimbad_campus.season import PAPER_DATES, Light, Season, drive_date
 from deepsimbad_campus.things import Shot, draw_panel, panels
 from deepsimbad_campus.world import Style, World
 from deepsimbad_campus.writer import JPEG_TIFF
@@ -47,7 +47,7 @@ def test_winter_ground_is_whiter_and_summer_trees_are_fuller(rendered):
     assert white["winter"] > 3 * max(white["spring"], white["autumn"])
     opaque = []
     for name in ("winter", "autumn", "summer"):
-        trees = draw_trees(season_of(drive_date(name), 0), 0)
+        trees = draw_trees(Season(drive_date(name), 0), 0)
         opaque.append(np.mean([levels[0][:300, :, 3] > 128 for levels in trees[:11]]))
     assert opaque == sorted(opaque)
 
@@ -63,14 +63,14 @@ def test_a_picture_is_equal_in_a_longer_drive_and_another_on_another_day(rendere
     assert np.abs(pictures[0] - pictures[1]).mean() > 10, "more than the grain, which is averaged away"
 
 
-STYLE = Style(5, "brick", 10.0, 6.0, 2, 3.0, True)
+STYLE = Style(5, "brick", 10.0, 6.0, True)
 
 
 def _wall_on_black(feet):
-    season, view, canvas = season_of(drive_date("summer"), 0), View(0, 0, 0), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    season, view, canvas = Season(drive_date("summer"), 0), View(0, 0, 0), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     shot, levels = Shot(canvas, view, Light(season, 1.0, 1.0)), draw_facade(STYLE, season, 1)
-    for _, ends, span in panels(np.array(feet, float), view):
-        draw_panel(shot, lambda style: levels, STYLE, shot.light.on_ground, ends, span)
+    for ends, span in panels(np.array(feet, float), view):
+        draw_panel(shot, levels, STYLE.height_m, shot.light.on_ground(1.0), ends, span)
     return canvas
 
 
