@@ -21,6 +21,7 @@ BANDS_M = (0.0, 4.0, 10.0, 24.0, 55.0, 1e9)  # distances at which a coarser pict
 LONGEST_SHADOW_M = 45.0
 LABELS = {name: label for label, name in enumerate(("grass", *pictures.PAVING))}
 GROUND_SHAPE = (HEIGHT - GROUND_ROW, WIDTH)
+Line = tuple[tuple[float, float], tuple[float, float], float, Colour]  # metres along and right of its ends; width, ink
 
 
 class Renderer:
@@ -44,9 +45,8 @@ class Renderer:
         view = self._drive.view(frame)
         # What is drawn, seen from the middle, leans and nods and turns: a stored column is an upright row, and stored
         # rows count the upright columns from the right. Enlarging comes last because it is dearest.
-        lean, nod = -view.roll_rad, FOCAL_PX * np.tan(view.pitch_rad)
-        cos, sin = np.cos(lean), np.sin(lean)
-        x, y = WIDTH / 2, HEIGHT / 2 - nod
+        cos, sin = np.cos(view.roll_rad), -np.sin(view.roll_rad)
+        x, y = WIDTH / 2, HEIGHT / 2 - FOCAL_PX * np.tan(view.pitch_rad)
         (wide, tall), (width, height) = camera.SEEN_SIZE, camera.UPRIGHT_SIZE
         turn = np.array([[sin, cos, tall / 2 - sin * x - cos * y], [-cos, sin, wide / 2 + cos * x - sin * y]])
         window = cv2.warpAffine(self._canvas(frame, view), turn, (tall, wide), flags=cv2.INTER_LINEAR)
@@ -161,48 +161,42 @@ class Renderer:
 
     def _mark(self, shot: Shot) -> None:
         """Draw the path's joints and the road's broken line."""
-        route, position_m, light = self._world.route, shot.position_m, shot.light
+        position_m, light, lines = shot.position_m, shot.light, list[Line]()
         joint, paint = light.seen([(112, 116, 118), (170, 200, 205)], light.on_ground(1.0), 0).tolist()
-
-        def line(along_m: list[float], right_m: list[float], width_m: float, ink: Colour) -> None:
-            first, last = route.place(np.array(along_m), np.array(right_m))
-            north, east = last - first
-            side = np.array([-east, north]) / max(np.hypot(north, east), 1e-6) * width_m / 2
-            fill(
-                shot.canvas, shot.view.to_camera(np.stack([first - side, last - side, last + side, first + side])), ink
-            )
-
         for section in shot.sections:
-            stretch, half, road_m = section.stretch, section.path_half_width_m, section.road_right_m
-            for joint_m in np.arange(stretch.start_m + 2, min(stretch.end_m, position_m + 30), 2.5):
-                if section.path_surface == "concrete" and joint_m > position_m - 2:
-                    line([joint_m, joint_m], [-half, half], 0.03, joint)
-            for dash_m in np.arange(stretch.start_m, stretch.start_m + stretch.straight_m, 6.0):
-                if road_m is not None and position_m - 4 < dash_m < position_m + 70:
-                    line([dash_m, dash_m + 3.0], [road_m, road_m], 0.12, paint)
+            start_m, half, road_m = section.stretch.start_m, section.path_half_width_m, section.road_right_m
+            if section.path_surface == "concrete":
+                joints = np.arange(start_m + 2, min(section.stretch.end_m, position_m + 30), 2.5)
+                lines += [((m, m), (-half, half), 0.03, joint) for m in joints if m > position_m - 2]
+            if road_m is not None:
+                dashes = np.arange(start_m, min(start_m + section.stretch.straight_m, position_m + 70), 6.0)
+                lines += [((m, m + 3.0), (road_m, road_m), 0.12, paint) for m in dashes if m > position_m - 4]
+        for along_m, right_m, width_m, ink in lines:
+            first, last = shot.view.to_camera(self._world.route.place(np.array(along_m), np.array(right_m)))
+            right, ahead = last - first
+            side = np.array([ahead, -right]) / np.hypot(right, ahead) * width_m / 2
+            fill(shot.canvas, np.stack([first - side, last - side, last + side, first + side]), ink)
 
 
 def _shadows(shot: Shot) -> Image:
     """[HEIGHT - GROUND_ROW, WIDTH] 255 where the ground is in shade, else 0."""
-    mask, light = np.zeros(GROUND_SHAPE, np.uint8), shot.light
-    north, east, up = light.sun
-    reach_per_m, ring = -np.array([north, east]) / max(up, 0.05), np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    mask, light, outlines = np.zeros(GROUND_SHAPE, np.uint8), shot.light, list[Array]()
+    reach_per_m, ring = -light.sun[:2] / light.sun[2], np.linspace(0, 2 * np.pi, 10, endpoint=False)
     length_per_m, circle = np.hypot(*reach_per_m), np.stack([np.cos(ring), np.sin(ring)], axis=1)
-    direction, leaves, outlines = reach_per_m / max(length_per_m, 1e-6), light.season.leaf_share, list[Array]()
+    direction, leaves = reach_per_m / length_per_m, light.season.leaf_share
     side = np.array([-direction[1], direction[0]]) * 0.12
     for section in shot.sections if light.sunshine >= 0.15 else ():
         for block in section.blocks:
-            reach = reach_per_m * min(block.height_m, LONGEST_SHADOW_M / max(length_per_m, 1e-6))
+            reach = reach_per_m * min(block.height_m, LONGEST_SHADOW_M / length_per_m)
             corners = np.concatenate([block.corners(), block.corners() + reach]).astype(np.float32)
             outlines.append(np.asarray(cv2.convexHull(corners), np.float64)[:, 0])
         for place, kind, height, *_ in section.things:
             reach, ahead = reach_per_m * height * 0.62, shot.view.to_camera(place)[1]
             if kind in ("tree", "conifer") and np.hypot(*reach) <= LONGEST_SHADOW_M and -30 < ahead < 70:
                 outlines.append(place + np.stack([-side, side, reach + side, reach - side]))
-                is_bare = leaves < 0.15 and kind == "tree"
-                crown = circle * (height * (0.12 if is_bare else 0.16 + 0.12 * leaves))
-                stretched = crown + np.outer(crown @ direction * 0.5 * length_per_m, direction)
-                outlines.append(place + reach + stretched)
+                crown = circle * height * (0.12 if leaves < 0.15 and kind == "tree" else 0.16 + 0.12 * leaves)
+                stretch = np.outer(crown @ direction * 0.5 * length_per_m, direction)
+                outlines.append(place + reach + crown + stretch)
     for outline in outlines:
         fill(mask, shot.view.to_camera(outline), (255,))
     return mask

@@ -68,8 +68,8 @@ class Light:
     def __init__(self, season: Season, sunshine: float, exposure: float) -> None:
         self.season, self.sunshine, self.exposure = season, sunshine, exposure
         azimuth, elevation = np.deg2rad(season.sun_azimuth_deg), np.deg2rad(season.sun_elevation_deg)
-        flat = np.cos(elevation)
-        self.sun = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))  # unit vector: north, east, up
+        flat = np.cos(elevation)  # [3] unit vector to the sun: north, east, up
+        self.sun = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
         self.air = np.array(season.horizon) * exposure  # [3] what haze looks like
 
     def gain(self, towards_sun: float) -> Array:
