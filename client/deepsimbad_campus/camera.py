@@ -84,5 +84,4 @@ def window(canvas: Image, low: Pair, high: Pair) -> tuple[tuple[int, int], Image
 
 def ink(colour: ArrayLike) -> list[int]:
     """A colour as OpenCV draws with it."""
-    values: list[int] = np.clip(colour, 0, 255).astype(int).tolist()
-    return values
+    return [min(max(int(value), 0), 255) for value in np.asarray(colour).tolist()]
