@@ -116,10 +116,10 @@ def _detections(rng: np.random.Generator, season: Season, sightings: list[Sighti
 def _caption(rng: np.random.Generator, season: Season, ground: str, sightings: list[Sighting]) -> str:
     """The caption of a picture by an imitated person."""
     largest = sorted(sightings, key=lambda thing: (thing[1][0] - thing[1][2]) * (thing[1][3] - thing[1][1]))
-    middles = [(label, (box[0] + box[2]) / 2) for label, box in largest]
-    sides = ("on the left" if middle < 0.38 else "on the right" if middle > 0.62 else "ahead" for _, middle in middles)
-    counts = Counter(zip((label for label, _ in largest), sides, strict=True))
-    phrases = []
+    counts, phrases = Counter[tuple[str, str]](), list[str]()
+    for label, (left, _, right, _) in largest:
+        middle = (left + right) / 2
+        counts[label, "on the left" if middle < 0.38 else "on the right" if middle > 0.62 else "ahead"] += 1
     for (label, side), count in list(counts.items())[:NAMED]:
         word = rng.choice(WORDS.get(label, (label,)))
         omission, mistake = rng.random(2)

@@ -144,19 +144,17 @@ class Renderer:
 
     def _labels(self, shot: Shot) -> Image:
         """[HEIGHT - GROUND_ROW, WIDTH] index of the tile that every pixel below the horizon is paved with."""
-        labels, position_m, route = np.zeros(GROUND_SHAPE, np.uint8), shot.position_m, self._world.route
+        labels, route = np.zeros(GROUND_SHAPE, np.uint8), self._world.route
+        patches = [patch for section in shot.sections for patch in section.patches]
         # Short pieces of path near by, where a bend shows; long ones far away.
-        cuts_m = position_m + np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 126, 9)])
-        for section in shot.sections:
-            for outline, surface in section.patches:
-                fill(labels, shot.view.to_camera(outline), (LABELS[surface],))
+        cuts_m = np.concatenate([np.arange(-4, 21, 1.5), np.arange(23, 60, 4), np.arange(62, 126, 9)])
         for section in reversed(shot.sections):
-            first, last = max(section.stretch.start_m, position_m - 4), min(section.stretch.end_m, position_m + 125)
-            if first < last:
-                path_m, half = np.unique(np.clip(cuts_m, first, last)), section.path_half_width_m
-                left, right = (shot.view.to_camera(route.place(path_m, side)) for side in (-half, half))
-                for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
-                    fill(labels, quad, (LABELS[section.path_surface],))
+            path_m = np.clip(shot.position_m + cuts_m, section.stretch.start_m, section.stretch.end_m)
+            left, right = (route.place(np.unique(path_m), side * section.path_half_width_m) for side in (-1, 1))
+            quads = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
+            patches += [(quad, section.path_surface) for quad in quads]
+        for outline, surface in patches:
+            fill(labels, shot.view.to_camera(outline), (LABELS[surface],))
         return labels
 
     def _mark(self, shot: Shot) -> None:
