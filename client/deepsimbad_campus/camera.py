@@ -78,7 +78,8 @@ def fill(image: Image, ground: Array, ink: Colour) -> None:
 
 def window(canvas: Image, low: Pair, high: Pair) -> tuple[tuple[int, int], Image]:
     """The first pixel (x, y) of the part of the canvas between two corners, and the part, which may be empty."""
-    left, top, right, bottom = np.clip([*low, *high], 0, (WIDTH, HEIGHT) * 2).astype(int).tolist()
+    left, right = (min(max(int(x), 0), WIDTH) for x in (low[0], high[0]))
+    top, bottom = (min(max(int(y), 0), HEIGHT) for y in (low[1], high[1]))
     return (left, top), canvas[top:bottom, left:right]
 
 

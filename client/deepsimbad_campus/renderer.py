@@ -108,7 +108,7 @@ class Renderer:
             gain = shot.light.gain(-east * shot.light.sun[0] + north * shot.light.sun[1])  # its normal points right
             for ends, span in things.panels(feet, shot.view):
                 draw = partial(things.draw_panel, shot, self._facade(style), style.height_m, gain, ends, span)
-                queue.append((ends[:, 1].mean(), draw))
+                queue.append((float(ends[0, 1] + ends[1, 1]) / 2, draw))
         for thing in things.around(self._world, self._drive, frame):
             kind, foot = things.KINDS[thing.kind], shot.view.to_camera(thing.place)
             if camera.NEAR_M < foot[1] < SIGHT_M and abs(foot[0]) < foot[1] * camera.HALF_VIEW + kind.margin_m:
@@ -117,30 +117,26 @@ class Renderer:
             draw()
 
     def _paint_ground(self, shot: Shot) -> None:
-        light, ground, labels, shadows = shot.light, shot.canvas[GROUND_ROW:], self._labels(shot), _shadows(shot)
-        for level, (near, far) in enumerate(pairwise(BANDS_M)):
-            rows = np.flatnonzero((near <= camera.AHEAD_M) & (far > camera.AHEAD_M))
-            band = slice(rows[0], rows[-1] + 1)
-            painted = self._surfaces(camera.AHEAD_M[band], level, shot.view, labels[band])
-            distance = min(camera.AHEAD_M[band].mean(), 90.0)
-            ground[band] = light.shine_on(painted, light.on_ground(1.0), distance)
-            cv2.copyTo(light.shine_on(painted, light.gain(0), distance), shadows[band], ground[band])
-        self._mark(shot)
-
-    def _surfaces(self, ahead_m: Array, level: int, view: View, labels: Image) -> Image:
-        """The ground's own colours in a band of rows."""
-        scale = np.float32(pictures.TILE_PX / pictures.TILE_M / (1 << level))
+        view, light, ground = shot.view, shot.light, shot.canvas[GROUND_ROW:]
+        labels, shadows = self._labels(shot), _shadows(shot)
         cos, sin = np.float32(np.cos(view.heading_rad)), np.float32(np.sin(view.heading_rad))
-        ahead = ahead_m[:, None].astype(np.float32)
+        ahead = camera.AHEAD_M[:, None].astype(np.float32)
         right = (ahead * camera.SLOPE).astype(np.float32)
-        north = (ahead * cos - right * sin + np.float32(view.north_m % pictures.TILE_M)) * scale
-        east = (ahead * sin + right * cos + np.float32(view.east_m % pictures.TILE_M)) * scale
-        painted = np.zeros((*labels.shape, 3), np.uint8)
-        for label in np.unique(labels):
-            tile = self._tiles[label][level]
-            layer = cv2.remap(tile, east, north, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-            cv2.copyTo(layer, (labels == label).view(np.uint8), painted)
-        return painted
+        north = ahead * cos - right * sin + np.float32(view.north_m % pictures.TILE_M)
+        east = ahead * sin + right * cos + np.float32(view.east_m % pictures.TILE_M)
+        for level, (near_m, far_m) in enumerate(pairwise(BANDS_M)):
+            first, *_, last = np.flatnonzero((near_m <= camera.AHEAD_M) & (far_m > camera.AHEAD_M))
+            band, per_m = slice(first, last + 1), np.float32(pictures.TILE_PX / pictures.TILE_M / (1 << level))
+            x, y, paved = east[band] * per_m, north[band] * per_m, np.zeros_like(ground[band])
+            for label, levels in enumerate(self._tiles):
+                mask = (labels[band] == label).view(np.uint8)
+                if mask.any():
+                    layer = cv2.remap(levels[level], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+                    cv2.copyTo(layer, mask, paved)
+            distance = min(camera.AHEAD_M[band].mean(), 90.0)
+            ground[band] = light.shine_on(paved, light.on_ground(1.0), distance)
+            cv2.copyTo(light.shine_on(paved, light.gain(0), distance), shadows[band], ground[band])
+        self._mark(shot)
 
     def _labels(self, shot: Shot) -> Image:
         """[HEIGHT - GROUND_ROW, WIDTH] index of the tile that every pixel below the horizon is paved with."""

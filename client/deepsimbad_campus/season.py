@@ -71,13 +71,13 @@ class Light:
         flat = np.cos(elevation)  # [3] unit vector to the sun: north, east, up
         self.sun = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
         self.air = np.array(season.horizon) * exposure  # [3] what haze looks like
+        # Under cloud the sky itself is brighter.
+        self._sky = np.array(season.ambient) / 255 * (1.12 - 0.12 * sunshine) * (season.exposure * exposure)
+        self._direct = np.array(season.sun) / 255 * season.sun_strength * sunshine * (season.exposure * exposure)
 
     def gain(self, towards_sun: float) -> Array:
         """[3] factor on a colour for a surface whose normal has this cosine to the sun; 0 is in shade."""
-        season = self.season
-        direct = season.sun_strength * self.sunshine * max(0.0, towards_sun)
-        sky = np.array(season.ambient) / 255 * (1.12 - 0.12 * self.sunshine)  # under cloud the sky itself is brighter
-        return np.asarray((sky + direct * np.array(season.sun) / 255) * (season.exposure * self.exposure), np.float64)
+        return np.asarray(self._sky + max(0.0, towards_sun) * self._direct, np.float64)
 
     def on_ground(self, share: float) -> Array:
         """[3] factor for the ground, or what stands on it, where so much of it is in the sun."""
@@ -90,7 +90,7 @@ class Light:
     def seen(self, colours: ArrayLike, gain: Array, distance_m: float) -> Image:
         """[..., 3] the colours at a distance of surfaces of [..., 3] own colours, or of [..., 1] greys."""
         share = self.haze(distance_m)
-        return np.clip(np.multiply(colours, gain) * (1 - share) + self.air * share, 0, 255).astype(np.uint8)
+        return np.minimum(np.multiply(colours, gain) * (1 - share) + self.air * share, 255).astype(np.uint8)
 
     def shine_on(self, picture: Image, gain: Array, distance_m: float) -> Image:
         """A picture of a surface's own colours as the camera sees it at a distance."""
