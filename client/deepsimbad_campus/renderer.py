@@ -156,7 +156,7 @@ class Renderer:
     def _mark(self, shot: Shot) -> None:
         """Draw the path's joints and the road's broken line."""
         position_m, light, lines = shot.position_m, shot.light, list[Line]()
-        joint, paint = light.seen([(112, 116, 118), (170, 200, 205)], light.on_ground(1.0), 0).tolist()
+        joint, paint = light.tones([(112, 116, 118), (170, 200, 205)], light.on_ground(1.0), 0).tolist()
         for section in shot.sections:
             start_m, half, road_m = section.stretch.start_m, section.path_half_width_m, section.road_right_m
             if section.path_surface == "concrete":

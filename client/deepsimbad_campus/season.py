@@ -68,10 +68,11 @@ class Light:
     def __init__(self, season: Season, sunshine: float, exposure: float) -> None:
         self.season, self.sunshine, self.exposure = season, sunshine, exposure
         azimuth, elevation = np.deg2rad(season.sun_azimuth_deg), np.deg2rad(season.sun_elevation_deg)
-        flat = np.cos(elevation)  # [3] unit vector to the sun: north, east, up
+        flat = np.cos(elevation)
+        # [3] unit vector to the sun: north, east, up.
         self.sun = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
         self.air = np.array(season.horizon) * exposure  # [3] what haze looks like
-        # Under cloud the sky itself is brighter.
+        # Light from the sky, which is brighter under cloud, and from the sun.
         self._sky = np.array(season.ambient) / 255 * (1.12 - 0.12 * sunshine) * (season.exposure * exposure)
         self._direct = np.array(season.sun) / 255 * season.sun_strength * sunshine * (season.exposure * exposure)
 
@@ -87,11 +88,11 @@ class Light:
         """Share of a colour that haze has taken at a distance, 0..1."""
         return 1.0 - float(np.exp(-self.season.haze_per_m * distance_m))
 
-    def seen(self, colours: ArrayLike, gain: Array, distance_m: float) -> Image:
+    def tones(self, colours: ArrayLike, gain: Array, distance_m: float) -> Image:
         """[..., 3] the colours at a distance of surfaces of [..., 3] own colours, or of [..., 1] greys."""
         share = self.haze(distance_m)
         return np.minimum(np.multiply(colours, gain) * (1 - share) + self.air * share, 255).astype(np.uint8)
 
     def shine_on(self, picture: Image, gain: Array, distance_m: float) -> Image:
         """A picture of a surface's own colours as the camera sees it at a distance."""
-        return np.asarray(cv2.LUT(picture, self.seen(SHADES, gain, distance_m)), np.uint8)
+        return np.asarray(cv2.LUT(picture, self.tones(SHADES, gain, distance_m)), np.uint8)

@@ -113,9 +113,8 @@ def draw_panel(shot: Shot, levels: Levels, height_m: float, gain: Array, feet: A
     level = _level(levels, len(levels[0]) / max(1.0, (low - high)[:, 1].max()))
     height, width = level.shape[:2]
     outline = np.stack([high[0], high[1], low[1], low[0]])
-    (left, top), roi = camera.window(
-        shot.canvas, outline.min(0).astype(int) - (2, 1), outline.max(0).astype(int) - (-3, -2)
-    )
+    pixels = outline.astype(int)
+    (left, top), roi = camera.window(shot.canvas, pixels.min(0) - (2, 1), np.add(pixels.max(0), (3, 2)))
     if not roi.size:
         return
     first, last = max(0, int(span[0] * width) - 1), min(width, int(np.ceil(span[1] * width)) + 1)
@@ -156,7 +155,7 @@ def _draw_car(shot: Shot, car: Thing, centre: Array) -> None:
     nose, side = np.array([np.sin(turn), np.cos(turn)]), np.array([np.cos(turn), -np.sin(turn)])
 
     def face(ground: Array, heights: Array, colour: Colour, gain: Array) -> None:
-        ink = light.seen(colour, gain, distance).tolist()
+        ink = light.tones(colour, gain, distance).tolist()
         cv2.fillPoly(shot.canvas, [sixteenths(project(ground, heights))], ink, cv2.LINE_AA, 4)
 
     shadow, base = np.array([(-2.3, -1), (2.3, -1), (2.3, 1), (-2.3, 1)]), light.on_ground(0.45)
@@ -187,7 +186,7 @@ def _draw_person(shot: Shot, walker: Thing, foot: Array) -> None:
     _draw_boxes(shot, [*feet, (-0.25, 0.25, 0.78, 1.46, coat), *arms], foot, unit, gain, taper=0.9)
     x, y = np.round(project(foot) - (0, 1.6 * unit)).astype(int).tolist()
     for colour, drop_m, size_m in (((38, 46, 60), 0.0, 0.13), ((120, 150, 196), 0.03, 0.1)):  # hair and face
-        ink = shot.light.seen(colour, gain, foot[1]).tolist()
+        ink = shot.light.tones(colour, gain, foot[1]).tolist()
         centre, radius = (x, y + round(drop_m * unit)), max(1, round(size_m * unit))
         cv2.circle(shot.canvas, centre, radius, ink, -1, cv2.LINE_AA)
 
@@ -213,7 +212,7 @@ def _draw_boxes(shot: Shot, boxes: Sequence[Box], foot: Array, unit: float, gain
     """Draw upright boxes around a foot, so many pixels a metre."""
     for left, right, low, high, colour in boxes:
         corners = np.array([(left, low), (right, low), (right * taper, high), (left * taper, high)])
-        ink = shot.light.seen(colour, gain, foot[1]).tolist()
+        ink = shot.light.tones(colour, gain, foot[1]).tolist()
         cv2.fillConvexPoly(shot.canvas, sixteenths(project(foot) + corners * (unit, -unit)), ink, cv2.LINE_AA, 4)
 
 
