@@ -14,12 +14,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.measurement import ACTIONS_M, RESULTS, Command, machine, markdown, print_page
-from bench.recordings import evaluator_of, real_recordings
+from bench.recordings import encoded, evaluator_of, real_recordings
 from deepsimbad.core.building import MapPlan, compose_map
-from deepsimbad.core.drive import Drive
 from deepsimbad.core.localizer import ActiveLocalizer, LocalizerConfig
 from deepsimbad.core.map import Map
 from deepsimbad.core.relevance import DEFAULT_RELEVANCE
@@ -78,13 +76,9 @@ def _bold(text: str, is_miss: bool) -> str:
     return f"**{text}**" if is_miss else text
 
 
-def _images(folder: Path, frames: slice) -> list[Image]:
-    files = sorted(file for file in folder.iterdir() if file.suffix in {".png", ".jpg"})[frames]
-    return [np.asarray(cv2.imread(str(file)), np.uint8) for file in files]
-
-
-def _encoded(evaluator: Evaluator, images: list[Image]) -> NDArray[np.float32]:
-    return np.concatenate([evaluator.encode(images[first : first + 8]) for first in range(0, len(images), 8)])
+def _images(folder: Path, frames: range) -> list[Image]:
+    files = sorted(file for file in folder.iterdir() if file.suffix in {".png", ".jpg"})
+    return [np.asarray(cv2.imread(str(files[frame])), np.uint8) for frame in frames]
 
 
 def lines() -> Iterator[str]:
@@ -94,19 +88,18 @@ def lines() -> Iterator[str]:
     railway = (data / "nordland" / "summer", data / "nordland" / "winter")
     corridor = (data / "corridor" / "ref", data / "corridor" / "query")
     drives = {
-        "Nordland": (*railway, slice(1000)),
-        "corridor": (*corridor, slice(111)),
-        "its first half": (*corridor, slice(56)),
-        "its second half": (*corridor, slice(56, 111)),
+        "Nordland": (*railway, range(1000)),
+        "corridor": (*corridor, range(111)),
+        "its first half": (*corridor, range(56)),
+        "its second half": (*corridor, range(56, 111)),
     }
     for extractor in EXTRACTORS:
         evaluator = evaluator_of(extractor)
         rows: dict[str, list[str]] = {}
         for map_folder, live_folder, numbers in drives.values():
-            encodings = _encoded(evaluator, _images(map_folder, numbers))
-            training = Drive(position_m=np.arange(float(len(encodings))), encodings=encodings)
+            training = encoded(f"{map_folder}#{numbers.start}:{numbers.stop}", extractor)
             plan = MapPlan(DEFAULT_RELEVANCE, 4, ACTIONS_M)
-            map_ = compose_map(plan, training, None, None, min(N_LANDMARKS, len(encodings) // 2)).map
+            map_ = compose_map(plan, training, None, None, min(N_LANDMARKS, training.n_frames // 2)).map
             for kind, frames in kinds.items():
                 share, bits = informative_views(map_, evaluator, frames, N_VIEWS)
                 rows.setdefault(kind, []).extend((f"{100 * share:.0f}", _bold(f"{bits:.1f}", bits > MOST_BITS)))
