@@ -31,7 +31,9 @@ def compare(checkouts: Sequence[Path]) -> None:
             folders = [checkout.resolve(strict=True) / name for name in ("service", "client", "migrations")]
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
             command = [sys.executable, "-m", "bench.request", "--measure"]
-            output = subprocess.check_output(command, cwd=PROJECT, env=environment)  # noqa: S603 - itself
+            output = subprocess.check_output(  # noqa: S603 - itself
+                command, cwd=PROJECT, env=environment, stderr=subprocess.DEVNULL
+            )
             print(f"turn {turn + 1}, {checkout}: {float(output):.2f} ms")
 
 
