@@ -1,6 +1,7 @@
 """Evaluators that are fitted to images, from upload to answers: what waits, what is learnt, what goes wrong by name."""
 
 import sqlite3
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -157,7 +158,7 @@ def test_a_fit_that_is_cancelled_or_cannot_be_leaves_the_spool(tmp_path, monkeyp
             assert client.remap("stopped", **REMAP)["state"] == "cancelled"
             assert [n_waiting(client, "stopped", name)[0] for name in ("first", "second")] == [N, N]
             cancels.pop(0)
-        with sqlite3.connect(tmp_path / "domains/stopped/traverses/first.sqlite") as db:
+        with closing(sqlite3.connect(tmp_path / "domains/stopped/traverses/first.sqlite")) as db:
             assert db.execute("SELECT count(*) FROM view_encoding").fetchone()[0] > 0, "what is done need not be again"
         failed_job = client.remap("stopped", **{**REMAP, "n_landmarks": 1, "list_length": 1})
         assert failed_job["error"]["code"] == "too_few_to_fit"

@@ -131,8 +131,8 @@ def test_robots_go_on_while_a_replica_dies(fleet, client):
             wait_for_views()
         finally:
             stopped.set()
-    for ended in robots:
-        ended.result()
+    for robot_run in robots:
+        robot_run.result()
     assert faults == []
 
 

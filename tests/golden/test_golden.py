@@ -10,6 +10,7 @@ import json
 import os
 import sqlite3
 import time
+from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def drives(tmp_path_factory):
 
 def content(path):
     """Every table of a map file, without what a clock or a release wrote."""
-    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as file:
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as file:
         tables = [row[0] for row in file.execute("select name from sqlite_master where type = 'table' order by name")]
         cells = {}
         for table in (table for table in tables if not table.startswith(("_", "sqlite_"))):
