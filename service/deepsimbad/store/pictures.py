@@ -74,8 +74,8 @@ def clear_spool(db: Database, indices: Sequence[int], contents: Sequence[int]) -
     """Before frames are written: delete pictures of those indices, and views but those of equal pictures."""
     db.conn.executemany(
         """
-        DELETE FROM view_encoding WHERE frame_index = ?1
-            AND (SELECT content_digest FROM frame WHERE frame_index = ?1) IS NOT ?2
+        DELETE FROM view_encoding WHERE frame_index = ?
+            AND (SELECT content_digest FROM frame WHERE frame.frame_index = view_encoding.frame_index) IS NOT ?
         """,
         zip(indices, contents, strict=True),
     )
