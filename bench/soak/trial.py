@@ -117,6 +117,9 @@ def _live_and_die(server: LocalServer, actors: list[Actor], aim: str, rng: np.ra
     threads = [threading.Thread(target=act, args=(actor,)) for actor in actors]
     for thread in threads:
         thread.start()
+    # In the first life everybody is answered once: what was never acknowledged cannot be lost.
+    while all(thread.is_alive() for thread in threads) and not all(actor.n_acknowledged for actor in actors):
+        time.sleep(0.01)
     time.sleep(float(rng.uniform(0.0, LONGEST_LIFE_S)))
     give_up_at = time.monotonic() + _AIMING_S
     while not any(actor.doing.startswith(aim) for actor in actors) and time.monotonic() < give_up_at:
