@@ -6,6 +6,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -119,6 +120,15 @@ def test_a_file_that_is_made_by_many_at_once_is_whole(tmp_path: Path) -> None:
     at_once(4 * [lambda: open_working_file(tmp_path / "a.sqlite", catalog_migrations, create=True).close()])
 
 
+def test_a_file_that_another_one_makes_at_this_moment_is_waited_for(tmp_path: Path) -> None:
+    with open_database(tmp_path / "a.sqlite", create=True) as first:
+        first.conn.execute("BEGIN IMMEDIATE")
+        timer = threading.Timer(0.3, first.conn.execute, ["COMMIT"])
+        timer.start()
+        open_working_file(tmp_path / "a.sqlite", catalog_migrations, create=True).close()
+        timer.join()
+
+
 def test_a_file_of_another_kind_or_of_a_newer_release_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.sqlite"
     with open_working_file(path, catalog_migrations, create=True) as db:
@@ -143,6 +153,7 @@ def test_a_closed_file_keeps_its_log_empty(tmp_path: Path) -> None:
 
 CHILD = """
 import sys
+import threading
 from pathlib import Path
 from deepsimbad.store.durable import service_lock
 with service_lock(Path(sys.argv[1]), "127.0.0.1:8000"):

@@ -3,6 +3,7 @@
 import asyncio
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -19,6 +20,7 @@ T = TypeVar("T")
 FileState: TypeAlias = tuple[int, ...]
 _Write: TypeAlias = tuple[Callable[[Database], Any], Future[Any]]
 
+BUSY_TIMEOUT_S = 10.0
 MAX_BATCH = 256  # writes in one transaction; with so many no more are added
 _STRANGE_SCHEMA = "SELECT 1 FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0 LIMIT 1"
 
@@ -33,7 +35,7 @@ def open_database(path: Path, *, read_only: bool = False, create: bool = False, 
     connection = sqlite3.connect(
         f"{path.resolve().as_uri()}?mode={mode}",
         uri=True,
-        timeout=10.0,
+        timeout=BUSY_TIMEOUT_S,
         isolation_level=None,  # no transaction begins behind our back
         check_same_thread=False,
     )
@@ -148,7 +150,7 @@ def open_working_file(path: Path, migrations: Migrations, *, create: bool = Fals
             raise DamagedFileError(f"{path.name} is damaged: it is empty", file=path.name)
         if is_checked:
             check_integrity(db, path)
-        db.conn.execute("PRAGMA journal_mode = WAL")
+        _write_ahead(db)
         db.conn.execute("PRAGMA synchronous = FULL")
         if pending_migrations(db, migrations, path):
             with write_transaction(db):  # two processes that try at once both succeed
@@ -157,6 +159,19 @@ def open_working_file(path: Path, migrations: Migrations, *, create: bool = Fals
         db.close()
         raise
     return db
+
+
+def _write_ahead(db: Database) -> None:
+    """Give the file a write-ahead log: where many make one file at once SQLite refuses that without waiting."""
+    give_up_at_s = time.monotonic() + BUSY_TIMEOUT_S
+    while True:
+        try:
+            db.conn.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > give_up_at_s:
+                raise
+            time.sleep(0.01)
 
 
 class OpenFile:
