@@ -153,7 +153,6 @@ def test_a_closed_file_keeps_its_log_empty(tmp_path: Path) -> None:
 
 CHILD = """
 import sys
-import threading
 from pathlib import Path
 from deepsimbad.store.durable import service_lock
 with service_lock(Path(sys.argv[1]), "127.0.0.1:8000"):
