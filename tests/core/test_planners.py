@@ -68,6 +68,26 @@ def slow_values(bits, actions_m, news, price, closed):
     return values
 
 
+def slow_doubt_bits(mass, actions_m, closed=False):
+    """Bits by which a robot more probably is not within 5 m of the mode after moves, images a metre apart."""
+    n, mode, step_m = len(mass), int(mass.argmax()), 0.001
+    ahead_m = np.arange(n) - mode
+    if closed:
+        ahead_m = (ahead_m + n // 2) % n - n // 2
+    near = np.abs(ahead_m) <= 5
+    bits = []
+    for action_m in actions_m:
+        std_m = np.sqrt(0.05**2 + 0.01 * abs(action_m))
+        still = 0.0
+        for share, error_m in ((0.6, std_m), (0.4, np.hypot(std_m, 0.2 * action_m))):
+            for image in np.flatnonzero(near):
+                off_m = np.arange(-5, 5, step_m) + step_m / 2 - ahead_m[image]
+                density = np.exp(-0.5 * (off_m / error_m) ** 2) / (error_m * np.sqrt(2 * np.pi))
+                still += mass[image] * share * density.sum() * step_m
+        bits.append(np.log2((1 - still) / (1 - mass[near].sum())))
+    return np.array(bits)
+
+
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("actions_m", [(1.0, 4.0, 10.0), (-3.0, 0.0, 5.0)])
 def test_the_value_of_a_move_is_what_views_from_there_on_are_worth(closed, actions_m, bits):
@@ -103,8 +123,8 @@ def test_where_nobody_knows_what_views_tell_it_goes_far():
     ],
 )
 def test_no_move_leads_past_an_end_while_another_stays(place, actions_m, expected_m, known_bits):
-    flat = np.ones(N_IMAGES, np.float32) if known_bits else None
-    plan = plan_by_information(view_of(sharp(place), flat, actions_m=np.array(actions_m)))
+    flat, farther_is_newer = np.ones(N_IMAGES, np.float32) if known_bits else None, np.linspace(1, 0, 11)
+    plan = plan_by_information(view_of(sharp(place), flat, actions_m=np.array(actions_m), novelty=farther_is_newer))
     assert (plan.action_m, plan.chance_on_route > 0.97) == (expected_m, True)
 
 
@@ -117,18 +137,36 @@ def test_where_every_move_leads_past_the_end_it_is_the_one_that_most_probably_st
     assert (plan.action_m, plan.chance_on_route) == (10, pytest.approx(1))
 
 
-def test_moves_are_weighed_by_the_whole_belief_and_ties_go_far(bits):
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("place", [None, 2, 120])
+def test_moves_are_weighed_by_the_whole_belief_and_by_what_they_leave_in_doubt(bits, place, closed):
     mass = np.random.default_rng(0).dirichlet(np.ones(N_IMAGES))
-    view = view_of(mass, bits)
+    if place is not None:
+        mass = 0.02 * mass + 0.98 * np.eye(N_IMAGES)[place]
+    view = view_of(mass, bits, closed=closed)
     plan = plan_by_information(view)
     table = mass @ information_ahead(view.map, 0.0)
-    np.testing.assert_allclose(np.r_[plan.values, plan.bits], table, rtol=1e-5)
-    ahead = [bits[m + 4] if m + 4 < N_IMAGES else bits.mean() for m in range(N_IMAGES)]
+    table[:10] -= slow_doubt_bits(mass, ACTIONS_M, closed)
+    np.testing.assert_allclose(np.r_[plan.values, plan.bits], table, rtol=1e-4, atol=1e-4)
+    to = [(m + 4) % N_IMAGES for m in range(N_IMAGES)]
+    ahead = [bits[to[m]] if closed or to[m] == m + 4 else bits.mean() for m in range(N_IMAGES)]
     assert plan.bits[3] == pytest.approx(mass @ ahead, rel=1e-5)
-    flat = np.ones(N_IMAGES, np.float32)
-    assert plan_by_information(view_of(mass, flat)).action_m == 10
+
+
+def test_of_equal_moves_the_longer_one_forward():
+    flat, mass = np.ones(N_IMAGES, np.float32), np.full(N_IMAGES, 1 / N_IMAGES)
     for actions_m, longest_m in (((-10.0, 0.0, 10.0), 10), ((-10.0, 0.0, 9.0), -10)):
-        assert plan_by_information(view_of(mass, flat, actions_m=np.array(actions_m))).action_m == longest_m
+        newer = view_of(mass, flat, actions_m=np.array(actions_m), novelty=np.linspace(1, 0, 11))
+        assert plan_by_information(newer).action_m == longest_m
+
+
+def test_a_robot_that_hardly_doubts_its_place_moves_no_farther_than_it_can_tell():
+    flat, novelty = np.ones(N_IMAGES, np.float32), np.r_[1.0, 0.5, 0.3, 0.2, 0.15, 0.1, 0.08, 0.06, 0.04, 0.02, 0.0]
+    moves_m = []
+    for doubt in (0.5, 0.02, 0.002):
+        mass = (1 - doubt) * np.eye(N_IMAGES)[50] + doubt * np.eye(N_IMAGES)[150]
+        moves_m.append(plan_by_information(view_of(mass, flat, novelty=novelty)).action_m)
+    assert moves_m[0] == 10 > moves_m[1] > moves_m[2] > 3
 
 
 def test_places_that_hold_next_to_nothing_move_no_average():
@@ -136,8 +174,9 @@ def test_places_that_hold_next_to_nothing_move_no_average():
     mass = np.full(n_images, 3.5e-9)
     mass[place] += 1 - mass.sum()
     view = view_of(mass, (1 + np.random.default_rng(0).random(n_images)).astype(np.float32))
-    plan = plan_by_information(view)
-    np.testing.assert_allclose(np.r_[plan.values, plan.bits], information_ahead(view.map, 0.0)[place], rtol=3e-6)
+    plan, row = plan_by_information(view), information_ahead(view.map, 0.0)[place]
+    np.testing.assert_allclose(plan.values + slow_doubt_bits(mass, ACTIONS_M), row[:10], rtol=1e-4)
+    np.testing.assert_allclose(plan.bits, row[10:], rtol=3e-6)
 
 
 def test_metres_have_a_price(bits):

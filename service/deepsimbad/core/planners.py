@@ -10,6 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepsimbad.core.belief.cells import SUMS
+from deepsimbad.core.belief.motion import usual_errors
+from deepsimbad.core.belief.summary import near_mode_after
 from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.map import Map
 from deepsimbad.core.route import Route
@@ -75,13 +77,16 @@ def plan_by_experience(view: PlanningView) -> Plan | None:
 def plan_by_information(view: PlanningView) -> Plan:
     """The move whose views ahead tell most bits on average over the belief (ours); of equals the longer, forward one.
 
-    Where nobody knows what views tell it is the longest move. A move that more probably leads past an end of the route
-    than not is taken only where all do; then it is the one that most probably stays.
+    What a move's error takes from a robot that knows its place is subtracted. Where nobody knows what views tell it is
+    the longest move. A move that more probably leads past an end of the route than not is taken only where all do; then
+    it is the one that most probably stays.
     """
     actions_m = view.map.actions_m
     table = information_ahead(view.map, view.price_bits_per_m)
     averages = np.zeros(2 * actions_m.size) if table is None else _averaged(view.mass, table.T)
     values, bits = averages[: actions_m.size], averages[actions_m.size :]
+    if table is not None:
+        values -= _doubt_bits(view)
     moves = sorted(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True), reverse=True)
     best_m, best_chance = 0.0, -1.0
     for *_, action_m in moves:
@@ -94,6 +99,17 @@ def plan_by_information(view: PlanningView) -> Plan:
     if table is None:
         return Plan(INFORMED, best_m, chance_on_route=best_chance)
     return Plan(INFORMED, best_m, values, bits, best_chance)
+
+
+def _doubt_bits(view: PlanningView) -> NDArray[np.float64]:
+    """[a] bits by which moves make it more probable that the robot is more than 5 m from the mode, by their errors.
+
+    It matters where that is improbable: a robot that hardly doubts its place gets less sure of it by a long move.
+    """
+    errors = usual_errors(*view.map.actions_m.tolist())
+    near = near_mode_after(view.map.route, view.mass, int(view.mass.argmax()), errors)
+    bits = np.log2(np.maximum(1 - near, _LEAST_MASS))
+    return np.asarray(bits[1:] - bits[0])
 
 
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:

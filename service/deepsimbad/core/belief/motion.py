@@ -36,10 +36,18 @@ def move_stds_m(action_m: float, action_std_m: float, doubt: Doubt) -> dict[floa
 
     Where odometry says that it is more exact than usual, its moves slip less in proportion.
     """
-    if not doubt.is_mixture:
-        return {1.0: action_std_m}
+    return _slipping(action_m, action_std_m) if doubt.is_mixture else {1.0: action_std_m}
+
+
+def _slipping(action_m: float, action_std_m: float) -> dict[float, float]:
     slip_m = _SLIP_SHARE * action_m * min(1.0, action_std_m / motion_std_m(action_m))
     return {_EXACT_SHARE: action_std_m, 1 - _EXACT_SHARE: float(np.hypot(action_std_m, slip_m))}
+
+
+@lru_cache(maxsize=64)  # maps have few sets of actions
+def usual_errors(*actions_m: float) -> NDArray[np.float64]:
+    """[a, 2, 2] probabilities and standard deviations of moves of usual odometry; shared, so not to be written to."""
+    return np.array([list(_slipping(action_m, motion_std_m(action_m)).items()) for action_m in actions_m])
 
 
 def check_ahead(

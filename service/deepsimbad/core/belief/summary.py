@@ -1,6 +1,7 @@
 """A belief in a few numbers."""
 
 from dataclasses import dataclass
+from math import erf
 
 import numpy as np
 from numba import njit
@@ -12,6 +13,7 @@ from deepsimbad.core.route import Route
 
 CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side
 DEFAULT_CONFIDENCE = 0.99
+_NO_MOVES = np.empty((0, 1, 2))
 _CREDIBLE_SHARE = 0.95
 _ENOUGH = 1 - 1e-12  # of that share: sums are rounded
 _SIZES = 1024  # classes of masses, sixteen an octave below the greatest; smaller ones count as the last
@@ -68,21 +70,41 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
 
 def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
     """The share of masses [n] no farther than 5 m from an image."""
-    return float(_near(mass, route.position_m, mode, route.length_m if route.closed else 0.0))
+    return float(near_mode_after(route, mass, mode, _NO_MOVES)[0])
+
+
+def near_mode_after(
+    route: Route, mass: NDArray[np.float64], mode: int, errors: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[1 + a] `near_mode`, and how much of it is still so near, of where it led, after moves that err.
+
+    Args:
+        errors: [a, k, 2] share and standard deviation in metres of the k normal curves that each move's error is of.
+    """
+    return np.asarray(_near(mass, route.position_m, mode, route.length_m if route.closed else 0.0, errors))
 
 
 @njit(cache=True, nogil=True)
-def _near(mass: NDArray[np.float64], position_m: NDArray[np.float64], mode: int, turn_m: float) -> float:
-    """See `near_mode`; `turn_m` is the length of a closed route, 0 of an open one."""
+def _near(
+    mass: NDArray[np.float64], position_m: NDArray[np.float64], mode: int, turn_m: float, errors: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """See `near_mode_after`; `turn_m` is the length of a closed route, 0 of an open one."""
+    near = np.zeros(1 + len(errors))
     if 0 < turn_m <= 2 * CONFIDENT_WITHIN_M:
-        return float(mass.sum())
-    near = 0.0
+        near[:] = mass.sum()
+        return near
     for turns in range(-1, 2) if turn_m > 0 else range(1):
         at_m = position_m[mode] + turns * turn_m
         first = np.searchsorted(position_m, at_m - CONFIDENT_WITHIN_M)
         last = np.searchsorted(position_m, at_m + CONFIDENT_WITHIN_M, side="right")
-        near += mass[first:last].sum()
-    return float(near)
+        near[0] += mass[first:last].sum()
+        for image in range(first, last):
+            room_m = CONFIDENT_WITHIN_M + at_m - position_m[image], CONFIDENT_WITHIN_M + position_m[image] - at_m
+            for move in range(len(errors)):
+                for share, std_m in errors[move]:
+                    stays = erf(room_m[0] / (np.sqrt(2) * std_m)) + erf(room_m[1] / (np.sqrt(2) * std_m))
+                    near[1 + move] += mass[image] * share * stays / 2
+    return near
 
 
 @njit(cache=True, nogil=True)
