@@ -12,7 +12,7 @@ from deepsimbad.core.belief.evidence import ViewEvidence
 from deepsimbad.core.belief.grid import GridFilter
 from deepsimbad.core.belief.motion import usual_errors
 from deepsimbad.core.belief.particles import FilterKind
-from deepsimbad.core.belief.summary import near_mode_after
+from deepsimbad.core.belief.summary import near_mode
 from deepsimbad.core.building import MapPlan, build_from_dissimilarities, compose_map
 from deepsimbad.core.descriptor import rank_landmarks
 from deepsimbad.core.drive import Drive
@@ -111,9 +111,7 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
         if ahead is None:
             assert (step.plan.action_m, step.plan.values) == (5.0, None)
         else:
-            near_shares = near_mode_after(
-                map_.route, belief.mass, int(belief.mass.argmax()), usual_errors(*map_.actions_m)
-            )
+            near_shares = near_mode(map_.route, belief.mass, int(belief.mass.argmax()), usual_errors(*map_.actions_m))
             doubt_bits = np.log2(np.maximum(1 - near_shares, 1e-6))
             expected = belief.mass @ ahead[:, :3] - (doubt_bits[1:] - doubt_bits[0])
             np.testing.assert_allclose(step.plan.values, expected, rtol=1e-4)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from deepsimbad.core.belief.cells import SUMS
 from deepsimbad.core.belief.motion import usual_errors
-from deepsimbad.core.belief.summary import near_mode_after
+from deepsimbad.core.belief.summary import near_mode
 from deepsimbad.core.index.retrieval import shortlist
 from deepsimbad.core.map import Map
 from deepsimbad.core.route import Route
@@ -85,8 +85,10 @@ def plan_by_information(view: PlanningView) -> Plan:
     table = information_ahead(view.map, view.price_bits_per_m)
     averages = np.zeros(2 * actions_m.size) if table is None else _averaged(view.mass, table.T)
     values, bits = averages[: actions_m.size], averages[actions_m.size :]
-    if table is not None:
-        values -= _doubt_bits(view)
+    if table is not None:  # the bits by which it gets more probable that the robot is not where it seems to be
+        near = near_mode(view.map.route, view.mass, int(view.mass.argmax()), usual_errors(*actions_m.tolist()))
+        doubt_bits = np.log2(np.maximum(1 - near, _LEAST_MASS))
+        values -= doubt_bits[1:] - doubt_bits[0]
     moves = sorted(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True), reverse=True)
     best_m, best_chance = 0.0, -1.0
     for *_, action_m in moves:
@@ -99,17 +101,6 @@ def plan_by_information(view: PlanningView) -> Plan:
     if table is None:
         return Plan(INFORMED, best_m, chance_on_route=best_chance)
     return Plan(INFORMED, best_m, values, bits, best_chance)
-
-
-def _doubt_bits(view: PlanningView) -> NDArray[np.float64]:
-    """[a] bits by which moves make it more probable that the robot is more than 5 m from the mode, by their errors.
-
-    It matters where that is improbable: a robot that hardly doubts its place gets less sure of it by a long move.
-    """
-    errors = usual_errors(*view.map.actions_m.tolist())
-    near = near_mode_after(view.map.route, view.mass, int(view.mass.argmax()), errors)
-    bits = np.log2(np.maximum(1 - near, _LEAST_MASS))
-    return np.asarray(bits[1:] - bits[0])
 
 
 def information_ahead(map_: Map, price_bits_per_m: float) -> NDArray[np.float32] | None:

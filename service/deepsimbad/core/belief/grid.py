@@ -122,7 +122,7 @@ class GridFilter:
         masses = _shift_and_spread(
             self.masses,
             (int(on_route_cells.start), int(on_route_cells.stop), shift),
-            mixed_error(cells.step_m, cells.n_cells, *move_stds_m(action_m, action_std_m, doubt).items()),
+            mixed_error(cells.step_m, cells.n_cells, *move_stds_m(action_m, action_std_m, doubt.is_mixture).items()),
             staying / total,
             found_mass / (total * cells.n_cells),
             cells.closed,

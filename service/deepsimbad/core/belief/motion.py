@@ -31,15 +31,13 @@ def motion_std_m(action_m: float) -> float:
     return float(np.sqrt(0.05**2 + 0.01 * abs(action_m)))
 
 
-def move_stds_m(action_m: float, action_std_m: float, doubt: Doubt) -> dict[float, float]:
+def move_stds_m(action_m: float, action_std_m: float, is_mixture: bool) -> dict[float, float]:
     """{probability: standard deviation} of a move: a mixture takes some to err by more than odometry says.
 
     Where odometry says that it is more exact than usual, its moves slip less in proportion.
     """
-    return _slipping(action_m, action_std_m) if doubt.is_mixture else {1.0: action_std_m}
-
-
-def _slipping(action_m: float, action_std_m: float) -> dict[float, float]:
+    if not is_mixture:
+        return {1.0: action_std_m}
     slip_m = _SLIP_SHARE * action_m * min(1.0, action_std_m / motion_std_m(action_m))
     return {_EXACT_SHARE: action_std_m, 1 - _EXACT_SHARE: float(np.hypot(action_std_m, slip_m))}
 
@@ -47,7 +45,7 @@ def _slipping(action_m: float, action_std_m: float) -> dict[float, float]:
 @lru_cache(maxsize=64)  # maps have few sets of actions
 def usual_errors(*actions_m: float) -> NDArray[np.float64]:
     """[a, 2, 2] probabilities and standard deviations of moves of usual odometry; shared, so not to be written to."""
-    return np.array([list(_slipping(action_m, motion_std_m(action_m)).items()) for action_m in actions_m])
+    return np.array([list(move_stds_m(action_m, motion_std_m(action_m), True).items()) for action_m in actions_m])
 
 
 def check_ahead(

@@ -124,7 +124,7 @@ class ParticleFilter:
             check_ahead(route, self.doubt, on_route, surviving, action_m)
         lost, staying, found_mass = leaving_and_found(self.doubt, self.doubt.lost, on_route, surviving, action_m)
         found_mass = found_mass + staying * self.found_mass  # what an uninformative view has not placed
-        stds_m = move_stds_m(action_m, action_std_m, self.doubt)
+        stds_m = move_stds_m(action_m, action_std_m, self.doubt.is_mixture)
         std_m = rng.choice(list(stds_m.values()), target_m.size, p=list(stds_m))
         position_m = _onto(route, target_m + std_m * rng.standard_normal(target_m.size))
         last = None if self.doubt.last is None else moved_along(route, self.doubt.last, action_m)

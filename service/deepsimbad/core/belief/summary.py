@@ -60,7 +60,7 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
         credible_95_sets_m=_pieces(route, ends),
         entropy_bits=max(0.0, entropy_bits),
         off_route=off_route,
-        near_mode=near_mode(route, mass, int(top[0])) * (1 - off_route),
+        near_mode=float(near_mode(route, mass, int(top[0]))[0]) * (1 - off_route),
         histogram_edges_m=edges_m,
         histogram_mass=route.histogram_of(mass),
         top=top,
@@ -68,15 +68,10 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
     )
 
 
-def near_mode(route: Route, mass: NDArray[np.float64], mode: int) -> float:
-    """The share of masses [n] no farther than 5 m from an image."""
-    return float(near_mode_after(route, mass, mode, _NO_MOVES)[0])
-
-
-def near_mode_after(
-    route: Route, mass: NDArray[np.float64], mode: int, errors: NDArray[np.float64]
+def near_mode(
+    route: Route, mass: NDArray[np.float64], mode: int, errors: NDArray[np.float64] = _NO_MOVES
 ) -> NDArray[np.float64]:
-    """[1 + a] `near_mode`, and how much of it is still so near, of where it led, after moves that err.
+    """[1 + a] the share of masses [n] no farther than 5 m from an image, and what of it still is after moves that err.
 
     Args:
         errors: [a, k, 2] share and standard deviation in metres of the k normal curves that each move's error is of.
@@ -88,7 +83,7 @@ def near_mode_after(
 def _near(
     mass: NDArray[np.float64], position_m: NDArray[np.float64], mode: int, turn_m: float, errors: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """See `near_mode_after`; `turn_m` is the length of a closed route, 0 of an open one."""
+    """See `near_mode`; `turn_m` is the length of a closed route, 0 of an open one."""
     near = np.zeros(1 + len(errors))
     if 0 < turn_m <= 2 * CONFIDENT_WITHIN_M:
         near[:] = mass.sum()

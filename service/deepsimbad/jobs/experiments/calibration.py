@@ -233,7 +233,8 @@ def _sight(belief: BeliefFilter, truth: int, is_refused: bool) -> Sight:
     route, mass = belief.route, belief.mass
     mode, members = int(mass.argmax()), smallest_set(mass)
     off_m = abs(float(route.offset_m(route.position_m[[truth]], float(route.position_m[mode]))[0]))
-    near_share, set_m = near_mode(route, mass, mode) * (1 - belief.doubt.off_route), float(route.cell_m[members].sum())
+    near_share = float(near_mode(route, mass, mode)[0]) * (1 - belief.doubt.off_route)
+    set_m = float(route.cell_m[members].sum())
     return Sight(members[truth], set_m, near_share, off_m <= CONFIDENT_WITHIN_M, belief.doubt.off_route, is_refused)
 
 

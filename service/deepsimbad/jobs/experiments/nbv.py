@@ -103,7 +103,7 @@ class EpisodeRunner:
         belief = step.state.belief
         mass, route = belief.mass, belief.route
         mode = int(mass.argmax())
-        if near_mode(route, mass, mode) * (1 - belief.doubt.off_route) < DEFAULT_CONFIDENCE:
+        if near_mode(route, mass, mode)[0] * (1 - belief.doubt.off_route) < DEFAULT_CONFIDENCE:
             return None
         frame = int(self.drive.route.nearest_image(np.array([position_m]))[0])
         truth_m = route.position_m[self.drive.true_image[frame]]
