@@ -5,19 +5,22 @@ can be put on the running service anywhere.
 """
 
 import resource
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from deepsimbad.errors import InvalidMapConfigError
+from deepsimbad.errors import InvalidMapConfigError, UnavailableError
 from deepsimbad.jobs.remap_config import RemapConfig
 from deepsimbad.jobs.runner import JobRunner
 from deepsimbad.store.catalog import Catalog
+from deepsimbad.store.connection import open_database
+from deepsimbad.store.durable import storage_faults
 from deepsimbad.store.records import JobRecord, JobState
 
 from .conftest import (
@@ -42,7 +45,7 @@ DISK_BYTES = 48 * 2**20
 
 
 @contextmanager
-def no_room_left(folder: Path, _service: Service) -> Iterator[None]:
+def no_room_left(folder: Path, _service: Service | None) -> Iterator[None]:
     """Fill the file system to its last block."""
     filler = folder / "filler"
     with filler.open("wb", buffering=0) as stream:
@@ -153,6 +156,22 @@ def test_a_job_that_finds_the_disk_full_says_so_and_leaves_nothing(furnished: Pa
             assert map_names() == names
             assert service.ended_job()["state"] == "succeeded"
         check_is_clean(data_dir)
+
+
+def test_a_file_that_is_read_on_a_full_disk_says_so():
+    with small_disk(2**20) as folder:
+        path = folder / "read.sqlite"
+        with closing(sqlite3.connect(path)) as db:
+            db.execute("PRAGMA journal_mode = wal")
+            db.execute("CREATE TABLE a (b)")
+        with (
+            open_database(path, read_only=True) as reader,
+            no_room_left(folder, None),
+            pytest.raises(UnavailableError) as caught,
+            storage_faults(path),
+        ):
+            reader.execute("SELECT b FROM a")
+        assert caught.value.hints["reason"] == "disk_full"
 
 
 @pytest.mark.parametrize("command_name", ["backup", "restore", "export", "import"])

@@ -34,8 +34,9 @@ _REASONS_BY_ERRNO = {
     **dict.fromkeys((errno.EEXIST, errno.ENOTDIR), "no_folder"),
     errno.ENOENT: "missing",
 }
-_REASONS_BY_SQLITE = {  # primary result codes
+_REASONS_BY_SQLITE = {  # primary result codes, but for the second
     sqlite3.SQLITE_FULL: "disk_full",
+    sqlite3.SQLITE_IOERR_SHMSIZE: "disk_full",  # who reads a file with a write-ahead log needs 32 kB beside it
     sqlite3.SQLITE_READONLY: "read_only",
     sqlite3.SQLITE_PERM: "read_only",
     sqlite3.SQLITE_BUSY: "busy",
@@ -75,7 +76,8 @@ def storage_faults(
         yield
     except (sqlite3.Error, UnicodeDecodeError, json.JSONDecodeError) as error:
         # Errors that Python's driver raises by itself carry no code: text that is not UTF-8, or a closed connection.
-        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        code = getattr(error, "sqlite_errorcode", 0)
+        code = code if code in _REASONS_BY_SQLITE else code & 0xFF
         if isinstance(error, sqlite3.ProgrammingError) and "closed" in str(error):
             code = sqlite3.SQLITE_MISUSE
         if code in _INPUT_CODES:
