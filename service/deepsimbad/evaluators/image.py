@@ -8,6 +8,7 @@ them would keep live views waiting.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from io import BytesIO
 from typing import Any
@@ -25,8 +26,9 @@ from deepsimbad.evaluators.image_files import JPEG, ImageFile, raise_truncated
 
 KEPT_PIXELS = 3840 * 2160
 
-# Bad input is answered by a named error; OpenCV's own words about it would only fill the server's log.
+# Bad input is answered by a named error; OpenCV's and Pillow's own words about it would only stand beside it.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
 
 _BLANK_BELOW_STD = 1.0  # grey levels of 256
 _FIELDS, _BLANK_BELOW_SHARE = 8, 0.25  # fields a side; share of all variation that lies between their means

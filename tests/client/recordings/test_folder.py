@@ -1,4 +1,6 @@
 import shutil
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -397,3 +399,14 @@ def test_one_missing_time_leaves_the_others_in_use(tmp_path):
     assert any("2 frames say no time" in remark for remark in recording.remarks)
     assert recording.frames[-1].position_m == pytest.approx(39, abs=1)
     assert [frame.timestamp_us for frame in recording.frames if frame.name in ("07.png", "39.png")] == [None, None]
+
+
+def test_a_damaged_picture_is_told_by_its_name_alone(tmp_path):
+    """Pillow warns of what it holds where it should say how the picture was taken."""
+    Image.new("RGB", (64, 48)).save(whole := tmp_path / "whole.tiff")
+    (tmp_path / "cut.tiff").write_bytes(whole.read_bytes()[:20])
+    look = (
+        "import sys; from deepsimbad_client.recordings.sources import open_source as o; print(o(sys.argv[1]).remarks)"
+    )
+    process = subprocess.run([sys.executable, "-c", look, tmp_path], capture_output=True, text=True, check=True)
+    assert (process.stderr, "2 images" in process.stdout) == ("", True)
