@@ -88,6 +88,14 @@ def slow_doubt_bits(mass, actions_m, closed=False):
     return np.array(bits)
 
 
+@pytest.mark.parametrize("doubt", [0.5, 0.1, 0.01, 1e-4, 1e-9])
+@pytest.mark.parametrize("actions_m", [(0.0, 10.0), (-20.0, 0.0, 20.0), (0.0, 50.0)])
+def test_no_robot_stays_because_it_would_not_err(actions_m, doubt):
+    mass = (1 - doubt) * np.eye(N_IMAGES)[90] + doubt * np.eye(N_IMAGES)[120]
+    plan = plan_by_information(view_of(mass, np.full(N_IMAGES, 2, np.float32), actions_m=np.array(actions_m)))
+    assert plan.action_m == actions_m[-1]
+
+
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("actions_m", [(1.0, 4.0, 10.0), (-3.0, 0.0, 5.0)])
 def test_the_value_of_a_move_is_what_views_from_there_on_are_worth(closed, actions_m, bits):

@@ -88,7 +88,8 @@ def plan_by_information(view: PlanningView) -> Plan:
     if table is not None:  # the bits by which it gets more probable that the robot is not where it seems to be
         near = near_mode(view.map.route, view.mass, int(view.mass.argmax()), usual_errors(*actions_m.tolist()))
         doubt_bits = np.log2(np.maximum(1 - near, _LEAST_MASS))
-        values -= doubt_bits[1:] - doubt_bits[0]
+        lost_bits = doubt_bits[1:] - doubt_bits[0]
+        values -= np.where(bits > 0, lost_bits, lost_bits.max())  # who stays errs least, and would never get on
     moves = sorted(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True), reverse=True)
     best_m, best_chance = 0.0, -1.0
     for *_, action_m in moves:

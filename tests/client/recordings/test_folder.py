@@ -403,10 +403,8 @@ def test_one_missing_time_leaves_the_others_in_use(tmp_path):
 
 def test_a_damaged_picture_is_told_by_its_name_alone(tmp_path):
     """Pillow warns of what it holds where it should say how the picture was taken."""
-    Image.new("RGB", (64, 48)).save(whole := tmp_path / "whole.tiff")
-    (tmp_path / "cut.tiff").write_bytes(whole.read_bytes()[:20])
-    look = (
-        "import sys; from deepsimbad_client.recordings.sources import open_source as o; print(o(sys.argv[1]).remarks)"
-    )
-    process = subprocess.run([sys.executable, "-c", look, tmp_path], capture_output=True, text=True, check=True)
+    Image.new("RGB", (64, 48)).save(whole_picture := tmp_path / "whole.tiff")
+    (tmp_path / "cut.tiff").write_bytes(whole_picture.read_bytes()[:20])
+    program = "from deepsimbad_client.recordings.sources import open_source; print(open_source('.').remarks)"
+    process = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert (process.stderr, "2 images" in process.stdout) == ("", True)
