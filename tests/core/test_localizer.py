@@ -112,7 +112,7 @@ def test_a_step_is_describe_retrieve_predict_update_plan(snapshots, queries, clo
             assert (step.plan.action_m, step.plan.values) == (5.0, None)
         else:
             near_shares = near_mode(map_.route, belief.mass, int(belief.mass.argmax()), usual_errors(*map_.actions_m))
-            doubt_bits = np.log2(np.maximum(1 - near_shares, 1e-6))
+            doubt_bits = 2 * np.log2(np.maximum(1 - near_shares, 1e-6))
             expected = belief.mass @ ahead[:, :3] - (doubt_bits[1:] - doubt_bits[0])
             np.testing.assert_allclose(step.plan.values, expected, rtol=1e-4)
         assert localizer.plan(step.state).action_m == step.plan.action_m

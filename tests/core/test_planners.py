@@ -84,7 +84,7 @@ def slow_doubt_bits(mass, actions_m, closed=False):
                 off_m = np.arange(-5, 5, step_m) + step_m / 2 - ahead_m[image]
                 density = np.exp(-0.5 * (off_m / error_m) ** 2) / (error_m * np.sqrt(2 * np.pi))
                 still += mass[image] * share * density.sum() * step_m
-        bits.append(np.log2((1 - still) / (1 - mass[near].sum())))
+        bits.append(2 * np.log2((1 - still) / (1 - mass[near].sum())))
     return np.array(bits)
 
 

@@ -21,6 +21,7 @@ NNQL, INFORMED, RANDOM, CONSTANT = "nnql", "informed", "random", "constant"
 DEFAULT_PLANNER = INFORMED
 NNQL_NEIGHBOURS = 4  # k of the paper
 _DISCOUNT, _SWEEPS = 0.9, 60
+_DOUBT_WEIGHT = 2.0  # bits of views, which are counted on a map that knows nothing, for a bit of doubt
 _IMAGES_AT_ONCE = 256  # few enough for single precision
 _LEAST_MASS = 1e-6  # of a belief; a block of images that holds less is left out of its averages
 PROBABLY = 0.5  # of a move to end on the route: with less another one is taken
@@ -87,7 +88,7 @@ def plan_by_information(view: PlanningView) -> Plan:
     values, bits = averages[: actions_m.size], averages[actions_m.size :]
     if table is not None:  # the bits by which it gets more probable that the robot is not where it seems to be
         near = near_mode(view.map.route, view.mass, int(view.mass.argmax()), usual_errors(*actions_m.tolist()))
-        doubt_bits = np.log2(np.maximum(1 - near, _LEAST_MASS))
+        doubt_bits = _DOUBT_WEIGHT * np.log2(np.maximum(1 - near, _LEAST_MASS))
         lost_bits = doubt_bits[1:] - doubt_bits[0]
         values -= np.where(bits > 0, lost_bits, lost_bits.max())  # who stays errs least, and would never get on
     moves = sorted(zip(values.tolist(), np.abs(actions_m).tolist(), actions_m.tolist(), strict=True), reverse=True)
