@@ -2,6 +2,7 @@
 
 import asyncio
 import sqlite3
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
@@ -322,3 +323,24 @@ def test_what_was_appended_before_the_end_is_on_the_disk_though_its_turn_never_e
     asyncio.run(append_and_close(store, number))
     with SessionStore.open(tmp_path) as again:
         assert len(again.journal(number)) == 1
+
+
+def test_where_no_transaction_begins_all_that_wait_are_told_at_once(
+    store: SessionStore, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever holds the file's lock would else be waited for by one robot after the other."""
+    attempts, all_wait = [], threading.Event()
+
+    @contextmanager
+    def held_by_another_process() -> Iterator[Any]:
+        attempts.append(all_wait.wait(60))
+        raise UnavailableError("busy")
+        yield
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store._commits, "_transaction", held_by_another_process)
+        writes = [store.append(number, observed(1), 101.0) for _ in range(6)]
+        all_wait.set()
+        assert [type(write.exception(60)) for write in writes] == [UnavailableError] * 6
+    assert len(attempts) <= 2, "the first may have begun alone"
+    store.append(number, observed(1), 101.0).result()

@@ -75,9 +75,12 @@ def file_state(path: Path) -> FileState:
 
     A log that begins anew is written over: it keeps its size.
     """
-    file, log = path.stat(), path.with_name(f"{path.name}-wal")
-    log_state = (log.stat().st_mtime_ns, log.stat().st_size) if log.exists() else (0, 0)
-    return file.st_ino, file.st_size, file.st_mtime_ns, *log_state
+    file = path.stat()
+    try:  # the last one that closes the file removes its log
+        log = path.with_name(f"{path.name}-wal").stat()
+    except FileNotFoundError:
+        return file.st_ino, file.st_size, file.st_mtime_ns, 0, 0
+    return file.st_ino, file.st_size, file.st_mtime_ns, log.st_mtime_ns, log.st_size
 
 
 @contextmanager
@@ -328,14 +331,16 @@ class GroupCommit:
                 return
 
     def _commit(self, batch: list[_Write]) -> None:
+        results: list[Any] | None = None  # until a transaction has begun
         try:
             with self._transaction() as db:
                 results = []
                 for run, _ in batch:
                     results.append(run(db))
         except BaseException as error:
-            if len(batch) == 1:
-                batch[0][1].set_exception(error)
+            if len(batch) == 1 or results is None:  # where none begins, every one would wait as long as the first
+                for _, future in batch:
+                    future.set_exception(error)
                 return
             for write in batch:  # one that cannot be written should not take the others with it
                 self._commit([write])
