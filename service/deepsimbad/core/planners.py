@@ -33,7 +33,7 @@ class PlanningView:
     """All a planner may look at: map, belief [n], relevance [n] of the last view, seed and step of its draws."""
 
     map: Map
-    mass: NDArray[np.float64]
+    mass: NDArray[np.float32]
     relevance: NDArray[np.float32] | None
     seed: int
     step: int
@@ -162,11 +162,11 @@ _PLANNERS: dict[str, Planner] = {INFORMED: plan_by_information, NNQL: plan_by_ex
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _averaged(mass: NDArray[np.float64], columns: NDArray[np.float32]) -> NDArray[np.float64]:
+def _averaged(mass: NDArray[np.float32], columns: NDArray[np.float32]) -> NDArray[np.float64]:
     """[a] means of columns [a, n] weighted by mass [n]. A loop of our own: BLAS would wake its threads for this."""
     averages, total = np.zeros(len(columns)), 0.0
     for begin in range(0, mass.size, _IMAGES_AT_ONCE):
-        shares = mass[begin : begin + _IMAGES_AT_ONCE].astype(np.float32)
+        shares = mass[begin : begin + _IMAGES_AT_ONCE]
         block_mass = shares.sum()
         if block_mass < _LEAST_MASS:
             continue

@@ -28,11 +28,11 @@ class Places:
     of_image: NDArray[np.intp]
     n_images: NDArray[np.intp]
 
-    def means(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def means(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """[n] values of images, in which all images of a place have the mean of theirs."""
         if self.position_m.size == values.size:
             return values
-        return np.asarray((np.bincount(self.of_image, values) / self.n_images)[self.of_image])
+        return np.asarray((np.bincount(self.of_image, values) / self.n_images)[self.of_image], np.float32)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class Route:
         n_bins = min(_HISTOGRAM_BINS, self.n_images) if self.length_m > 0 else 1
         return np.linspace(self.start_m, self.start_m + self.length_m, n_bins + 1)
 
-    def histogram_of(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+    def histogram_of(self, mass: NDArray[np.float32]) -> NDArray[np.float64]:
         """[b] masses of those bins, from masses of map images [n] that each spread over the stretch it stands for."""
         n_whole, share, share_behind = self._bin_ends
         if self.closed:  # the first image's stretch begins before the end
@@ -218,7 +218,7 @@ class Route:
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _sums_up_to(values: NDArray[np.float64], ends: NDArray[np.intp]) -> NDArray[np.float64]:
+def _sums_up_to(values: NDArray[np.float32], ends: NDArray[np.intp]) -> NDArray[np.float64]:
     """[b] sums of the values [n] between every end [b] and the end before."""
     sums, begin = np.zeros(ends.size), 0
     for number in range(ends.size):

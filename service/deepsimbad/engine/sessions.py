@@ -176,7 +176,7 @@ class Sessions:
             self._summaries.submit(view_of, session, session.expires_at, state, n_shortlist)
         )
 
-    async def mass(self, session_id: str, key_id: str | None = None) -> NDArray[np.float64]:
+    async def mass(self, session_id: str, key_id: str | None = None) -> NDArray[np.float32]:
         """[n] mass of every map image in a session's belief; sums to 1."""
         _, state = await self._read(session_id, key_id)
         return await asyncio.wrap_future(self._worker.submit(lambda: state.belief.belief.mass))

@@ -29,7 +29,7 @@ def test_of_a_uniform_belief(route):
 
 
 def test_of_two_peaks(route):
-    mass = np.zeros(100)
+    mass = np.zeros(100, np.float32)
     mass[20], mass[70] = 0.4, 0.6
     summary = summarise(route, mass, 2, 0.0)
     entropy_bits = -(0.4 * np.log2(0.4) + 0.6 * np.log2(0.6))
@@ -37,11 +37,12 @@ def test_of_two_peaks(route):
     assert figures == pytest.approx((70, 50, 0.6, entropy_bits))
     assert summary.credible_95_m == (20.0, 70.0)
     assert summary.credible_95_sets_m == [(20.0, 20.0), (70.0, 70.0)]
-    assert (summary.top.tolist(), summary.top_mass.tolist()) == ([70, 20], [0.6, 0.4])
+    assert summary.top.tolist() == [70, 20]
+    assert summary.top_mass.tolist() == pytest.approx([0.6, 0.4])
 
 
 def test_on_a_closed_route_mean_deviation_and_set_cross_the_start():
-    mass = np.zeros(100)
+    mass = np.zeros(100, np.float32)
     mass[[98, 99, 0, 1, 2]] = 0.2
     summary = summarise(Route(np.arange(100.0), closed=True), mass, 1, 0.0)
     assert min(summary.mean_m, 100 - summary.mean_m) == pytest.approx(0, abs=1e-9)
@@ -62,7 +63,7 @@ def test_of_a_map_of_one_image():
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=60).filter(lambda values: sum(values) > 1e-6), st.booleans())
 def test_the_set_is_the_smallest_that_holds_its_share(values, closed):
-    mass = np.array(values) / sum(values)
+    mass = (np.array(values) / sum(values)).astype(np.float32)
     route = Route(np.arange(0.0, 3 * mass.size, 3), closed)
     pieces = summarise(route, mass, 1, 0.0).credible_95_sets_m
     member = np.zeros(mass.size, bool)
@@ -70,6 +71,6 @@ def test_the_set_is_the_smallest_that_holds_its_share(values, closed):
         x = route.position_m
         member |= (x >= low) & (x <= high) if low <= high else (x >= low) | (x <= high)
     descending = np.sort(mass)[::-1]
-    n_needed = int(np.searchsorted(np.cumsum(descending), 0.95 - 1e-9)) + 1
-    assert mass[member].sum() >= 0.95 - 1e-6
+    n_needed = int(np.searchsorted(np.cumsum(descending, dtype=float), 0.95 - 2e-6)) + 1
+    assert mass[member].sum() >= 0.95 - 2e-6
     assert (mass[member] >= descending[n_needed - 1] - 1e-12).sum() >= n_needed

@@ -70,14 +70,14 @@ class Cells:
             (np.abs(self.place_m - self.position_m) <= _SAME * self.step_m).all()
         )
 
-    def of_places(self, values: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
+    def of_places(self, values: NDArray[np.float32], offset_m: float) -> NDArray[np.float32]:
         """[c] values at cells, interpolated linearly from those at places [p]."""
         if self.are_places:
             return _shared(values, -offset_m / self.step_m, self.closed, False)
         length_m = self.step_m * self.n_cells if self.closed else 0.0
         return _interpolated(values, self.place_m, self.start_m + offset_m, self.step_m, self.n_cells, length_m)
 
-    def to_places(self, mass: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
+    def to_places(self, mass: NDArray[np.float32], offset_m: float) -> NDArray[np.float32]:
         """[p] masses of places, summing to 1, from those of cells [c]: each has the stretch that is nearest to it."""
         if self.are_places:
             on_places = _shared(mass, offset_m / self.step_m, self.closed, True)
@@ -104,13 +104,13 @@ def copy_into(target: NDArray[Any], source: NDArray[Any]) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _shared(values: NDArray[np.float64], ahead: float, closed: bool, is_mass: bool) -> NDArray[np.float64]:
+def _shared(values: NDArray[np.float32], ahead: float, closed: bool, is_mass: bool) -> NDArray[np.float32]:
     """[n] values shifted by `ahead` of a step, from -1 to 1, each shared out between the steps on either side.
 
     Past an end of an open route values go on as they are at the end; a mass is 0 there, and none leaves the route.
     """
-    n, share = values.size, abs(ahead)
-    shared = np.empty(n)
+    n, share, no_mass = values.size, np.float32(abs(ahead)), np.float32(0)
+    shared = np.empty_like(values)
     if ahead >= 0:
         first, last = 0, n - 1
         for i in range(1, n):
@@ -119,7 +119,7 @@ def _shared(values: NDArray[np.float64], ahead: float, closed: bool, is_mass: bo
         first, last = n - 1, 0
         for i in range(n - 1):
             shared[i] = values[i] + share * (values[i + 1] - values[i])
-    edge = values[last] if closed else 0.0 if is_mass else values[first]
+    edge = values[last] if closed else no_mass if is_mass else values[first]
     shared[first] = values[first] + share * (edge - values[first])
     if is_mass and not closed:
         shared[last] += share * values[last]
@@ -128,10 +128,10 @@ def _shared(values: NDArray[np.float64], ahead: float, closed: bool, is_mass: bo
 
 @njit(cache=True, nogil=True)
 def _interpolated(
-    values: NDArray[np.float64], at_m: NDArray[np.float64], from_m: float, step_m: float, n: int, length_m: float
-) -> NDArray[np.float64]:
+    values: NDArray[np.float32], at_m: NDArray[np.float64], from_m: float, step_m: float, n: int, length_m: float
+) -> NDArray[np.float32]:
     """[n] values interpolated from those at ascending positions, constant past the ends; of a loop if length_m > 0."""
-    interpolated = np.empty(n)
+    interpolated = np.empty(n, np.float32)
     last = at_m.size - 1
     upper_place = 0
     for cell in range(n):
@@ -155,11 +155,11 @@ def _interpolated(
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _between(
-    mass: NDArray[np.float64], bounds_m: NDArray[np.float64], from_m: float, step_m: float, closed: bool
-) -> NDArray[np.float64]:
+    mass: NDArray[np.float32], bounds_m: NDArray[np.float64], from_m: float, step_m: float, closed: bool
+) -> NDArray[np.float32]:
     """[p] mass between ascending bounds [p + 1] of cells, the first about `from_m`; a cell's mass is spread evenly."""
     n, a_metre = mass.size, 1.0 / step_m
-    sums = np.empty(bounds_m.size - 1)
+    sums = np.empty(bounds_m.size - 1, np.float32)
     cell, used_mass = 0, 0.0  # of the cell: the mass that earlier places have
     if closed:
         first = (bounds_m[0] - from_m) * a_metre + 0.5

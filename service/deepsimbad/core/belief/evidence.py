@@ -41,19 +41,19 @@ class ViewEvidence:
 
     rule: UpdateRule
     # [n] log-likelihoods but for a constant, of mean 0; or the weights that additive rules add
-    values: NDArray[np.float64]
+    values: NDArray[np.float32]
     shared_error: float = 0.0  # c', share of its error that is that of the view before; counts where there was one
 
     @classmethod
     def of(cls, relevance: NDArray[np.float32], rule: UpdateRule, scale: float, shared_error: float = 0.0) -> Self:
         """From a view's relevance [n], which times `scale` is a log-likelihood."""
         if rule.is_additive:
-            return cls(rule, _addends(relevance, rule).astype(np.float64))
+            return cls(rule, _addends(relevance, rule).astype(np.float32))
         return cls(rule, _centred(relevance, scale), shared_error if rule is UpdateRule.MIXTURE else 0.0)
 
     def likelihood(
-        self, values: NDArray[np.float64], last: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.float64], float]:
+        self, values: NDArray[np.float32], last: NDArray[np.float32] | None
+    ) -> tuple[NDArray[np.float32], float]:
         """How likely the view is, by what its values [m] say beyond the last view's.
 
         Args:
@@ -87,31 +87,31 @@ def _addends(relevance: NDArray[np.float32], rule: UpdateRule) -> NDArray[np.flo
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float64]:
+def _centred(relevance: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
     """[n] `scale` times the relevance less its mean."""
     total = 0.0
     for i in range(relevance.size):
         total += relevance[i]
-    mean, values = total / relevance.size, np.empty(relevance.size)
+    mean, factor, values = np.float32(total / relevance.size), np.float32(scale), np.empty_like(relevance)
     for i in range(relevance.size):
-        values[i] = scale * (relevance[i] - mean)
+        values[i] = factor * (relevance[i] - mean)
     return values
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _news(
-    values: NDArray[np.float64], last: NDArray[np.float64], shared_error: float, trust: float
-) -> tuple[NDArray[np.float64], float]:
+    values: NDArray[np.float32], last: NDArray[np.float32], shared_error: float, trust: float
+) -> tuple[NDArray[np.float32], float]:
     """What values [m] say beyond the last ones [m], of whose error theirs contains the share `shared_error`.
 
     Returns:
         [m] `trust` times that, shifted so that the greatest is 0; and the mean size of it without trust and shift.
     """
-    news, size, factor = np.empty(values.size), 0.0, trust / (1 + shared_error)
-    greatest = factor * (values[0] - shared_error * last[0])
+    news, size, factor, shared = np.empty_like(values), 0.0, trust / (1 + shared_error), np.float32(shared_error)
     for i in range(values.size):
-        news[i] = factor * (values[i] - shared_error * last[i])
+        news[i] = np.float32(factor) * (values[i] - shared * last[i])
         size += abs(news[i])
+    greatest = news[0]
     for i in range(values.size):
         greatest = max(greatest, news[i])
     for i in range(values.size):
@@ -126,7 +126,7 @@ class Doubt:
     lost: NDArray[np.float64]  # [t] probability of being lost, by trust
     log_trust: NDArray[np.float64]  # [t] logarithm of each trust's weight: how well it has predicted the views so far
     # [n] values of the last view that showed a place, carried along by the moves since; and how far these have led
-    last: NDArray[np.float64] | None = None
+    last: NDArray[np.float32] | None = None
     since_last_m: float = 0.0
 
     @classmethod
@@ -151,9 +151,9 @@ class Doubt:
         """Probability of being lost."""
         return float(self.trust @ self.lost)
 
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
+    def arrays(self) -> dict[str, NDArray[np.floating]]:
         """The named arrays from which `from_arrays` restores it."""
-        arrays = {"lost": self.lost, "log_trust": self.log_trust}
+        arrays: dict[str, NDArray[np.floating]] = {"lost": self.lost, "log_trust": self.log_trust}
         if self.last is None:
             return arrays
         return {**arrays, "last": self.last, "since_last_m": np.array([self.since_last_m])}
@@ -162,20 +162,21 @@ class Doubt:
     def from_arrays(cls, arrays: dict[str, NDArray[np.float64]]) -> Self:
         """The doubt whose arrays `arrays` gave."""
         since_last_m = arrays.get("since_last_m", np.zeros(1))  # earlier releases had none
-        return cls(arrays["lost"], arrays["log_trust"], arrays.get("last"), float(since_last_m[0]))
+        last = arrays["last"].astype(np.float32) if "last" in arrays else None
+        return cls(arrays["lost"], arrays["log_trust"], last, float(since_last_m[0]))
 
 
-def moved_along(route: Route, values: NDArray[np.float64], action_m: float) -> NDArray[np.float64]:
+def moved_along(route: Route, values: NDArray[np.float32], action_m: float) -> NDArray[np.float32]:
     """[n] values of map images carried along by a move: each gets that of the place `action_m` behind it, or 0."""
     if action_m == 0 or route.length_m == 0:
         return values
     from_m = route.wrapped(route.position_m - action_m)
     if route.closed:
-        return np.interp(from_m, route.position_m, values, period=route.length_m)
-    return np.interp(from_m, route.position_m, values, left=0.0, right=0.0)
+        return np.interp(from_m, route.position_m, values, period=route.length_m).astype(np.float32)
+    return np.interp(from_m, route.position_m, values, left=0.0, right=0.0).astype(np.float32)
 
 
-def add_evidence(mass: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def add_evidence(mass: NDArray[np.floating], values: NDArray[np.float32]) -> NDArray[np.float64]:
     """Masses [m], summing to 1, after values [m] are added, as the paper adds `v[u_k]` to its particles' weights.
 
     Weights have mean 1 for that, so that the belief that knows nothing gives every hypothesis weight 1, however many

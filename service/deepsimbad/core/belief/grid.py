@@ -1,7 +1,8 @@
 """The exact belief: masses of equal cells along the route.
 
 A move shifts all cells, and its error is one short row of weights, the same everywhere. What a view says of map images
-is interpolated at the cells between them.
+is interpolated at the cells between them. Masses are in single precision, since those of many robots outgrow a
+processor's caches; their sums are in double.
 """
 
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from deepsimbad.core.route import Route
 _BLOCK = 1024  # cells whose sums stay in the first-level cache
 _ROUNDED = 1e-6  # of a mass; a difference below it is summed anew, since rounding would be felt
 _NOTHING = 1e-300  # of a mass: a view that leaves no more of a belief excludes it
+_LEAST_MASS = np.float32(1e-30)  # a lesser one is 0, before it gets so small that processors take it slowly
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class GridFilter:
     """A belief of c cells, by each of t trusts. Nothing is random."""
 
     route: Route
-    masses: NDArray[np.float64]  # [t, c] by trust; with `doubt.lost` each row sums to 1
+    masses: NDArray[np.float32]  # [t, c] by trust; with `doubt.lost` each row sums to 1
     offset_m: float  # by which all cells are ahead of where they began, at most half a cell
     doubt: Doubt  # its last view at the cells
     mass_moved: float = 0.0  # share that the last view moved elsewhere, or would have of a belief that knew nothing
@@ -65,30 +67,30 @@ class GridFilter:
     @classmethod
     def _of(cls, route: Route, mass: NDArray[np.float64], offset_m: float, rule: UpdateRule, lost: float) -> Self:
         doubt = Doubt.at_start(rule, lost)
-        return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()), offset_m, doubt)
+        return cls(route, np.outer(1 - doubt.lost, mass / mass.sum()).astype(np.float32), offset_m, doubt)
 
     @classmethod
     def from_arrays(cls, route: Route, arrays: dict[str, NDArray[np.float64]]) -> Self:
         """The belief whose arrays `arrays` gave; raises KeyError for those of another release."""
-        return cls(route, arrays["masses"], float(arrays["offset_m"][0]), Doubt.from_arrays(arrays))
+        return cls(route, arrays["masses"].astype(np.float32), float(arrays["offset_m"][0]), Doubt.from_arrays(arrays))
 
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
+    def arrays(self) -> dict[str, NDArray[np.floating]]:
         """The named arrays from which `from_arrays` restores it."""
         return {"masses": self.masses, "offset_m": np.array([self.offset_m]), **self.doubt.arrays()}
 
     @cached_property
-    def _believed(self) -> NDArray[np.float64]:
+    def _believed(self) -> NDArray[np.float32]:
         """[c] belief of cells, provided that the robot is on the route; sums to 1."""
         return _mixed(self.masses, self.doubt.lost, self.doubt.log_trust)
 
     @cached_property
-    def mass(self) -> NDArray[np.float64]:
+    def mass(self) -> NDArray[np.float32]:
         """[n] belief of map images, if the robot is on the route; sums to 1. A stop's images share a mass."""
         places = self.route.places
         on_places = self.route.cells.to_places(self._believed, self.offset_m)
         if places.position_m.size == self.route.n_images:
             return on_places
-        return np.asarray(on_places[places.of_image] / places.n_images[places.of_image])
+        return np.asarray(on_places[places.of_image] / places.n_images[places.of_image], np.float32)
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> "GridFilter":  # noqa: ARG002 - nothing is random
         """The belief after a move.
@@ -107,12 +109,11 @@ class GridFilter:
         shift, offset_m = cells.shifted(self.offset_m + action_m)
         for beyond_m in (reach_m if doubt.is_mixture or action_m == 0 else 0.0, reach_m):
             on_route_cells = cells.sources(shift, offset_m, beyond_m)
-            leaving = self.masses[:, : on_route_cells.start].sum(axis=1) + self.masses[:, on_route_cells.stop :].sum(
-                axis=1
-            )
+            low_masses, high_masses = self.masses[:, : on_route_cells.start], self.masses[:, on_route_cells.stop :]
+            leaving = low_masses.sum(axis=1, dtype=np.float64) + high_masses.sum(axis=1, dtype=np.float64)
             surviving = 1 - doubt.lost - leaving
             if surviving.min() < _ROUNDED:
-                surviving = self.masses[:, on_route_cells].sum(axis=1)
+                surviving = self.masses[:, on_route_cells].sum(axis=1, dtype=np.float64)
             on_route = surviving + leaving
             if (surviving > LEAST_SURVIVING_SHARE * on_route).any() or self.masses[:, on_route_cells].any():
                 break  # else it may still have stopped at the end
@@ -136,18 +137,19 @@ class GridFilter:
         values = self._at_cells(evidence.values)
         if evidence.rule.is_additive:
             mass, doubt = add_evidence(self._believed, values), self.doubt
-            masses, mass_moved = np.outer(1 - doubt.lost, mass), 0.5 * float(np.abs(mass - self._believed).sum())
+            masses = np.outer(1 - doubt.lost, mass).astype(np.float32)
+            mass_moved = 0.5 * float(np.abs(mass - self._believed).sum())
         else:
             likelihood, least_moved = evidence.likelihood(values, self.doubt.last)
             masses, lost, log_trust, mass_moved = _weigh(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
             doubt, mass_moved = Doubt(lost, log_trust, values), max(mass_moved, least_moved)
         return GridFilter(self.route, masses, self.offset_m, doubt, mass_moved)
 
-    def _at_cells(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _at_cells(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """[c] values at cells, interpolated from those of map images [n]; images of one stop count by their mean."""
         places = self.route.places
         if places.position_m.size < values.size:
-            values = np.bincount(places.of_image, values) / places.n_images
+            values = (np.bincount(places.of_image, values) / places.n_images).astype(np.float32)
         return self.route.cells.of_places(values, self.offset_m)
 
 
@@ -160,11 +162,11 @@ def _trusted(log_trust: NDArray[np.float64], lost: NDArray[np.float64]) -> NDArr
 
 @njit(cache=True, nogil=True)
 def _weigh(
-    masses: NDArray[np.float64],
+    masses: NDArray[np.float32],
     lost: NDArray[np.float64],
     log_trust: NDArray[np.float64],
-    likelihood: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+    likelihood: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], float]:
     """Multiply by likelihoods [c] of the least trust, normalise, and weigh the trusts.
 
     Where a view excludes all that a trust still believes, that trust keeps its shares of places: there is always a
@@ -183,7 +185,7 @@ def _weigh(
     for t in range(lost.size):
         if total[t] <= _NOTHING:
             total[t] = LEAST_ALLOWED * average[t]
-            kept_share[t] = total[t] / max(masses[t].sum(), _NOTHING)
+            kept_share[t] = total[t] / max(1.0 - lost[t], _NOTHING)
         explained = total[t] + lost[t] * average[t]
         gain[t] = 1.0 / explained
         lost_after[t] = lost[t] * average[t] * gain[t]
@@ -195,10 +197,10 @@ def _weigh(
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _mixed(
-    masses: NDArray[np.float64], lost: NDArray[np.float64], log_trust: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    masses: NDArray[np.float32], lost: NDArray[np.float64], log_trust: NDArray[np.float64]
+) -> NDArray[np.float32]:
     """[c] belief of cells over all trusts, provided that the robot is on the route; sums to 1."""
-    weight = _trusted(log_trust, lost)
+    weight = _trusted(log_trust, lost).astype(np.float32)
     mixed = weight[0] * masses[0]
     for t in range(1, weight.size):
         row, share = masses[t], weight[t]
@@ -209,7 +211,7 @@ def _mixed(
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _likelihoods(
-    masses: NDArray[np.float64], likelihood: NDArray[np.float64]
+    masses: NDArray[np.float32], likelihood: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """[t], [t] mean of each trust's likelihoods [c], over all cells and weighed by its masses."""
     n_trusts, n = masses.shape
@@ -228,13 +230,13 @@ def _likelihoods(
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _multiplied(
-    masses: NDArray[np.float64],
-    likelihood: NDArray[np.float64],
+    masses: NDArray[np.float32],
+    likelihood: NDArray[np.float32],
     kept_share: NDArray[np.float64],
     gain: NDArray[np.float64],
     weight: NDArray[np.float64],
     weight_after: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
+) -> tuple[NDArray[np.float32], float]:
     """Masses [t, c] times likelihoods and gains [t], and the sum over cells of how far the belief changes.
 
     Args:
@@ -242,16 +244,18 @@ def _multiplied(
         weight, weight_after: [t] weights of the trusts before and after.
     """
     n_trusts, n = masses.shape
-    posterior, total_change = np.empty((n_trusts, n)), 0.0
+    posterior, total_change = np.empty_like(masses), 0.0
     for begin in range(0, n, _BLOCK):
         powers = likelihood[begin : begin + _BLOCK].copy()
-        change = np.zeros(powers.size)
+        change = np.zeros_like(powers)
         for t in range(n_trusts):
             prior, row = masses[t, begin : begin + _BLOCK], posterior[t, begin : begin + _BLOCK]
             factor, kept_factor = 0.0 if kept_share[t] > 0 else gain[t], kept_share[t] * gain[t]
-            share, share_after = weight[t], weight_after[t]
+            factor, kept_factor = np.float32(factor), np.float32(kept_factor)
+            share, share_after = np.float32(weight[t]), np.float32(weight_after[t])
             for i in range(powers.size):
-                row[i] = prior[i] * (powers[i] * factor + kept_factor)
+                mass = prior[i] * (powers[i] * factor + kept_factor)
+                row[i] = mass if mass > _LEAST_MASS else np.float32(0)
                 change[i] += share_after * row[i] - share * prior[i]
                 powers[i] *= powers[i]
         for i in range(powers.size):
@@ -261,13 +265,13 @@ def _multiplied(
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _shift_and_spread(
-    masses: NDArray[np.float64],
+    masses: NDArray[np.float32],
     move: tuple[int, int, int],
     taps: NDArray[np.float64],
     gain: NDArray[np.float64],
     found_mass: NDArray[np.float64],
     closed: bool,
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Shift the masses [t, c] of a range of cells, spread them by a move's error, and add what is found everywhere.
 
     Args:
@@ -279,8 +283,8 @@ def _shift_and_spread(
     n_trusts, n = masses.shape
     first, stop, shift = move
     width = taps.size // 2
-    shifted = np.empty((n_trusts, n))
-    source = np.empty(n + 2 * width)
+    shifted = np.empty_like(masses)
+    source = np.empty(n + 2 * width, np.float32)
     on_route = source[width : width + n]
     for t in range(n_trusts):
         if closed:
@@ -306,12 +310,13 @@ def _shift_and_spread(
         for begin in range(0, n, _BLOCK):
             row = shifted[t, begin : begin + _BLOCK]
             middle = source[begin + width : n + 2 * width]
-            weight = taps[width] * gain[t]
+            weight, added_mass = np.float32(taps[width] * gain[t]), np.float32(found_mass[t])
             for i in range(row.size):
-                row[i] = found_mass[t] + weight * middle[i]
+                row[i] = added_mass + weight * middle[i]
             for away in range(1, width + 1, 2):  # two cells to either side at once; one that is no more weighs nothing
                 reach = min(away + 1, width)
-                near, far = taps[width + away] * gain[t], taps[width + reach] * gain[t] if reach > away else 0.0
+                near = np.float32(taps[width + away] * gain[t])
+                far = np.float32(taps[width + reach] * gain[t] if reach > away else 0.0)
                 left, right = source[begin + width - away :], source[begin + width + away :]
                 lefter, righter = source[begin + width - reach :], source[begin + width + reach :]
                 for i in range(row.size):
@@ -320,7 +325,7 @@ def _shift_and_spread(
 
 
 @njit(cache=True, nogil=True)
-def _shift(values: NDArray[np.float64], shift: int, closed: bool) -> NDArray[np.float64]:
+def _shift(values: NDArray[np.float32], shift: int, closed: bool) -> NDArray[np.float32]:
     """[c] values at cells, moved along with the robot by whole cells; what lies before an open route is 0."""
     carried, n = np.zeros_like(values), values.size
     by = shift % n if closed else min(max(shift, -n), n)

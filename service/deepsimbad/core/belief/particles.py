@@ -83,7 +83,7 @@ class ParticleFilter:
         """The belief whose arrays `arrays` gave."""
         return cls(route, arrays["position_m"], arrays["weights"], arrays["found"], Doubt.from_arrays(arrays), seed)
 
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
+    def arrays(self) -> dict[str, NDArray[np.floating]]:
         """The named arrays from which `from_arrays` restores it."""
         arrays = {"position_m": self.position_m, "weights": self.weights, "found": self.found_mass}
         return {**arrays, **self.doubt.arrays()}
@@ -94,7 +94,7 @@ class ParticleFilter:
         return np.asarray(self.doubt.trust @ self.weights)
 
     @cached_property
-    def mass(self) -> NDArray[np.float64]:
+    def mass(self) -> NDArray[np.float32]:
         """[n] belief of map images, sums to 1; a particle counts for its stretch, images of one place share a mass."""
         route, weights, order = self.route, self._mean_weights, np.argsort(self.position_m, kind="stable")
         if self.doubt.is_mixture:
@@ -102,7 +102,7 @@ class ParticleFilter:
         else:  # in the paper a particle counts for the image nearest to it
             mass = np.bincount(route.nearest_image(self.position_m), weights, route.n_images).astype(np.float64)
         mass = mass + (self.doubt.trust @ self.found_mass) * route.cell_m / route.cell_m.sum()
-        return np.asarray(mass / max(mass.sum(), _NOTHING), np.float64)
+        return np.asarray(mass / max(mass.sum(), _NOTHING), np.float32)
 
     def predicted(self, action_m: float, action_std_m: float, step: int) -> Self:
         """See `GridFilter.predicted`; a particle that would be past the end of an open route dies.
@@ -263,12 +263,12 @@ class _Profile:
     log: NDArray[np.float64]  # [w] of `likelihood`
 
     @classmethod
-    def of(cls, route: Route, likelihood: NDArray[np.float64]) -> Self:
+    def of(cls, route: Route, likelihood: NDArray[np.float32]) -> Self:
         """From the likelihoods of images [n], which are equal for images of one place."""
-        at_m = route.position_m
+        at_m, at_images = route.position_m, likelihood.astype(np.float64)
         if route.closed:
-            at_m, likelihood = np.append(at_m, route.start_m + route.length_m), np.append(likelihood, likelihood[0])
-        return cls(at_m, likelihood, np.log(np.maximum(likelihood, _NOTHING)))
+            at_m, at_images = np.append(at_m, route.start_m + route.length_m), np.append(at_images, at_images[0])
+        return cls(at_m, at_images, np.log(np.maximum(at_images, _NOTHING)))
 
     def at(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """[m] likelihoods of the least trust at positions on the route [m]."""

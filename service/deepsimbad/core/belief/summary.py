@@ -15,9 +15,9 @@ CONFIDENT_WITHIN_M = 5.0  # of the mode, to either side
 DEFAULT_CONFIDENCE = 0.99
 _NO_MOVES = np.empty((0, 1, 2))
 _CREDIBLE_SHARE = 0.95
-_ENOUGH = 1 - 1e-12  # of that share: sums are rounded
+_ENOUGH = 1 - 1e-6  # of that share: masses are rounded
 _SIZES = 1024  # classes of masses, sixteen an octave below the greatest; smaller ones count as the last
-_TO_SIZE = 48  # bits of a double below its exponent and the four that cut an octave
+_TO_SIZE = 19  # bits of a single below its exponent and the four that cut an octave
 _NOTHING = np.finfo(np.float32).tiny  # the least mass whose logarithm is taken
 
 
@@ -38,7 +38,7 @@ class BeliefSummary:
     histogram_edges_m: NDArray[np.float64]
     histogram_mass: NDArray[np.float64]
     top: NDArray[np.int64]  # ids of the map images with the greatest mass, best first
-    top_mass: NDArray[np.float64]  # their masses
+    top_mass: NDArray[np.float32]  # their masses
 
     @property
     def credible_95_m(self) -> tuple[float, float]:
@@ -46,10 +46,10 @@ class BeliefSummary:
         return self.credible_95_sets_m[0][0], self.credible_95_sets_m[-1][1]
 
 
-def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: float) -> BeliefSummary:
+def summarise(route: Route, mass: NDArray[np.float32], n_top: int, off_route: float) -> BeliefSummary:
     """Summarise masses over map images, [n], which sum to 1; `n_top` of the likeliest are listed."""
     top, edges_m = shortlist(mass, n_top), route.histogram_edges_m
-    bits = np.log2(np.maximum(mass.astype(np.float32), _NOTHING))
+    bits = np.log2(np.maximum(mass, _NOTHING))
     mean_m, std_m, entropy_bits, ends = _figures(
         mass, bits, route.position_m, route.turn, route.length_m, edges_m[1] - edges_m[0]
     )
@@ -69,7 +69,7 @@ def summarise(route: Route, mass: NDArray[np.float64], n_top: int, off_route: fl
 
 
 def near_mode(
-    route: Route, mass: NDArray[np.float64], mode: int, errors: NDArray[np.float64] = _NO_MOVES
+    route: Route, mass: NDArray[np.float32], mode: int, errors: NDArray[np.float64] = _NO_MOVES
 ) -> NDArray[np.float64]:
     """[1 + a] the share of masses [n] no farther than 5 m from an image, and what of it still is after moves that err.
 
@@ -79,32 +79,33 @@ def near_mode(
     return np.asarray(_near(mass, route.position_m, mode, route.length_m if route.closed else 0.0, errors))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=SUMS)
 def _near(
-    mass: NDArray[np.float64], position_m: NDArray[np.float64], mode: int, turn_m: float, errors: NDArray[np.float64]
+    mass: NDArray[np.float32], position_m: NDArray[np.float64], mode: int, turn_m: float, errors: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """See `near_mode`; `turn_m` is the length of a closed route, 0 of an open one."""
-    near = np.zeros(1 + len(errors))
+    near, total = np.zeros(1 + len(errors)), 0.0
+    for image in range(mass.size):
+        total += mass[image]
     if 0 < turn_m <= 2 * CONFIDENT_WITHIN_M:
-        near[:] = mass.sum()
-        return near
+        return near + 1.0
     for turns in range(-1, 2) if turn_m > 0 else range(1):
         at_m = position_m[mode] + turns * turn_m
         first = np.searchsorted(position_m, at_m - CONFIDENT_WITHIN_M)
         last = np.searchsorted(position_m, at_m + CONFIDENT_WITHIN_M, side="right")
-        near[0] += mass[first:last].sum()
         for image in range(first, last):
+            near[0] += mass[image]
             room_m = CONFIDENT_WITHIN_M + at_m - position_m[image], CONFIDENT_WITHIN_M + position_m[image] - at_m
             for move in range(len(errors)):
                 for share, std_m in errors[move]:
                     stays = erf(room_m[0] / (np.sqrt(2) * std_m)) + erf(room_m[1] / (np.sqrt(2) * std_m))
                     near[1 + move] += mass[image] * share * stays / 2
-    return near
+    return near / total  # in double: a planner asks how little is not near
 
 
 @njit(cache=True, nogil=True)
 def _figures(
-    mass: NDArray[np.float64],
+    mass: NDArray[np.float32],
     bits: NDArray[np.float32],
     position_m: NDArray[np.float64],
     turn: NDArray[np.float64],
@@ -123,7 +124,7 @@ def _figures(
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def _moments(
-    mass: NDArray[np.float64], position_m: NDArray[np.float64], turn: NDArray[np.float64], length_m: float
+    mass: NDArray[np.float32], position_m: NDArray[np.float64], turn: NDArray[np.float64], length_m: float
 ) -> tuple[float, float]:
     """Mean and standard deviation of the position; circular where `turn` [2, n] has a direction for every image."""
     mean_m, x, y, square = 0.0, 0.0, 0.0, 0.0
@@ -144,13 +145,13 @@ def _moments(
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
-def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float32], share: float) -> tuple[float, float]:
+def _entropy_and_least(mass: NDArray[np.float32], bits: NDArray[np.float32], share: float) -> tuple[float, float]:
     """Entropy in bits, and the least mass in the smallest set of images that holds a share.
 
     Rather than sort all masses, sum them by classes of size, and sort the one class where the share is reached. The bit
-    patterns of doubles that are not negative are in the doubles' order.
+    patterns of numbers that are not negative are in the numbers' order.
     """
-    pattern, greatest, entropy = mass.view(np.int64), 0, 0.0
+    pattern, greatest, entropy = mass.view(np.int32), 0, 0.0
     for i in range(mass.size):
         entropy -= mass[i] * bits[i]
         greatest = max(greatest, pattern[i])
@@ -165,7 +166,7 @@ def _entropy_and_least(mass: NDArray[np.float64], bits: NDArray[np.float32], sha
     while last_class < class_mass.size - 1 and total + class_mass[last_class] < share * _ENOUGH:
         total += class_mass[last_class]
         last_class += 1
-    class_members = np.empty(mass.size)
+    class_members = np.empty_like(mass)
     count = 0
     for i in range(mass.size):
         if size_class[i] == last_class:
@@ -194,7 +195,7 @@ def _pieces(route: Route, ends: NDArray[np.int64]) -> list[tuple[float, float]]:
 
 @njit(cache=True, nogil=True)
 def _stretches(
-    mass: NDArray[np.float64], least_mass: float, position_m: NDArray[np.float64], gap_m: float
+    mass: NDArray[np.float32], least_mass: float, position_m: NDArray[np.float64], gap_m: float
 ) -> NDArray[np.int64]:
     """[2, s] first and last of each run of images with `least_mass` or more; runs nearer than `gap_m` are one."""
     ends, n = np.empty((2, mass.size), np.int64), 0

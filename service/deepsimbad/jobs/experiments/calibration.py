@@ -131,10 +131,10 @@ def views_until_found(is_near: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(np.where(is_near.any(axis=1), is_near.argmax(axis=1) + 1, is_near.shape[1] + 1), np.int64)
 
 
-def smallest_set(mass: NDArray[np.float64]) -> NDArray[np.bool_]:
+def smallest_set(mass: NDArray[np.float32]) -> NDArray[np.bool_]:
     """[n] whether an image is in the smallest set that holds 95 % of the mass; all that tie with its last are."""
     masses = np.sort(mass)[::-1]
-    n_before = (np.cumsum(masses) < 0.95 * mass.sum() * (1 - 1e-12)).sum()
+    n_before = (np.cumsum(masses, dtype=np.float64) < 0.95 * (1 - 1e-6)).sum()
     return np.asarray(mass >= masses[n_before])
 
 

@@ -169,7 +169,7 @@ def _in_order(map_: Map, views: Query, queries: Drive) -> Iterator[tuple[NDArray
 def _outcome(
     map_: Map,
     relevance: NDArray[np.float32],
-    mass: NDArray[np.float64],
+    mass: NDArray[np.float32],
     truth: NDArray[np.int64],
     rank: float | None,
     nearest_image: int,
