@@ -79,15 +79,10 @@ class GridFilter:
         return {"masses": self.masses, "offset_m": np.array([self.offset_m]), **self.doubt.arrays()}
 
     @cached_property
-    def _believed(self) -> NDArray[np.float32]:
-        """[c] belief of cells, provided that the robot is on the route; sums to 1."""
-        return _mixed(self.masses, self.doubt.lost, self.doubt.log_trust)
-
-    @cached_property
     def mass(self) -> NDArray[np.float32]:
         """[n] belief of map images, if the robot is on the route; sums to 1. A stop's images share a mass."""
         places = self.route.places
-        on_places = self.route.cells.to_places(self._believed, self.offset_m)
+        on_places = self.route.cells.to_places(self._believed(), self.offset_m)
         if places.position_m.size == self.route.n_images:
             return on_places
         return np.asarray(on_places[places.of_image] / places.n_images[places.of_image], np.float32)
@@ -136,14 +131,19 @@ class GridFilter:
         """The belief after a view; `step` as of `predicted`."""
         values = self._at_cells(evidence.values)
         if evidence.rule.is_additive:
-            mass, doubt = add_evidence(self._believed, values), self.doubt
+            prior, doubt = self._believed(), self.doubt
+            mass = add_evidence(prior, values)
             masses = np.outer(1 - doubt.lost, mass).astype(np.float32)
-            mass_moved = 0.5 * float(np.abs(mass - self._believed).sum())
+            mass_moved = 0.5 * float(np.abs(mass - prior).sum())
         else:
             likelihood, least_moved = evidence.likelihood(values, self.doubt.last)
             masses, lost, log_trust, mass_moved = _weigh(self.masses, self.doubt.lost, self.doubt.log_trust, likelihood)
             doubt, mass_moved = Doubt(lost, log_trust, values), max(mass_moved, least_moved)
         return GridFilter(self.route, masses, self.offset_m, doubt, mass_moved)
+
+    def _believed(self) -> NDArray[np.float32]:
+        """[c] belief of cells, provided that the robot is on the route; sums to 1."""
+        return _mixed(self.masses, self.doubt.lost, self.doubt.log_trust)
 
     def _at_cells(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """[c] values at cells, interpolated from those of map images [n]; images of one stop count by their mean."""
