@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import json
 import math
 import time
 from datetime import UTC, datetime
@@ -269,6 +270,20 @@ def test_an_idempotency_key_counts_once(client):
         problem(refused, 422, "idempotency_key_reused")
     assert observe(client, path).json()["n_observations"] == 2
     assert observe(client, path, 1, **key).json()["belief"] == answers[0]["belief"]
+
+
+def test_a_brief_answer_is_the_whole_one_without_its_lists(client):
+    path, key = f"{client.session()}/observations", {"Idempotency-Key": "view-1"}
+    for url, headers in ((path, key), ("/v1/domains/ready/localizations", {})):
+        full_answer = client.answer_to("POST", url, json=RANKS, headers=headers)
+        response = client.post(url, params={"brief": True}, json=RANKS, headers=headers)
+        assert len(response.content) < 1000 < len(json.dumps(full_answer)) / 4
+        brief_answer = response.json()
+        for answer in (full_answer, brief_answer):
+            del answer["timings_ms"]
+        full_answer["belief"] |= {"histogram": {"edges_m": [], "mass": []}, "top": []}
+        full_answer["next_best_view"]["actions"] = full_answer["retrieval"] = []
+        assert brief_answer == full_answer
 
 
 def test_a_session_begun_twice_under_one_key_is_one(client, domain):

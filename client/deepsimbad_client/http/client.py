@@ -107,13 +107,14 @@ class SessionCalls(Face):
         action_m: float | None = None,
         action_std_m: float | None = None,
         shortlist: int | None = None,
+        brief: bool = False,
         idempotency_key: str | None = None,
         **view: Unpack[ViewForm],
     ) -> SessionAnswer:
         """Send what the robot sees now, after the metres it has moved; give exactly one form of the view.
 
-        The forms of a view and `shortlist` are those of `Client.localize`. `action_m` are the metres really
-        moved since the last view (absent: stood still; ignored for the first view), `action_std_m` how well
+        The forms of a view, `shortlist` and `brief` are those of `Client.localize`. `action_m` are the metres
+        really moved since the last view (absent: stood still; ignored for the first view), `action_std_m` how well
         they are known (absent: the service's usual odometry). A lost answer is asked for again and counts once.
         To repeat an observation yourself after a `TransportError`, choose its `idempotency_key`, and send the
         same again under it. Raises InvalidMoveError, LandmarkModelDiffersError, InvalidInputError, GoneError.
@@ -127,7 +128,7 @@ class SessionCalls(Face):
             "POST",
             f"{self._path}/observations",
             params={name: None if value is None else float(value) for name, value in move.items()}
-            | {"shortlist": shortlist},
+            | {"shortlist": shortlist, "brief": "true" if brief else None},
             headers=body.headers | idempotency_header(idempotency_key),
             body=body.body,
         )
@@ -305,19 +306,25 @@ class ClientCalls(Face, Generic[AnySession]):
 
     @shared
     async def localize(
-        self, domain: str, image: Image | None = None, *, shortlist: int | None = None, **view: Unpack[ViewForm]
+        self,
+        domain: str,
+        image: Image | None = None,
+        *,
+        shortlist: int | None = None,
+        brief: bool = False,
+        **view: Unpack[ViewForm],
     ) -> Localization:
         """Where one view probably is; give exactly one form of it.
 
         `image` is an encoded one (JPEG, PNG, TIFF, WebP), its path or open file, sent as it is, or an array of pixels,
         [height, width, 3] BGR or [height, width] grey, sent as PNG; the other forms are those of
-        `ViewForm`. `shortlist` is the length of `retrieval` and `belief.top`. Raises UnknownDomainError,
-        NoActiveMapError, LandmarkModelDiffersError (`on_board` was made with other landmarks than the map's),
-        InvalidInputError.
+        `ViewForm`. `shortlist` is the length of `retrieval` and `belief.top`; in `brief` these, the histogram and the
+        list of moves are empty, for a thin link. Raises UnknownDomainError, NoActiveMapError,
+        LandmarkModelDiffersError (`on_board` was made with other landmarks than the map's), InvalidInputError.
         """
         body = observation(image, **view)
         path = f"{domain_path(domain)}/localizations"
-        call = Call("POST", path, {"shortlist": shortlist}, body.headers, body.body)
+        call = Call("POST", path, {"shortlist": shortlist, "brief": "true" if brief else None}, body.headers, body.body)
         return await self._wire.model(Localization, call)
 
     @shared

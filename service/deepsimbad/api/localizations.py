@@ -129,6 +129,10 @@ OBSERVATION_BODY = observation_body()
 Shortlist = Annotated[
     int | None, Query(ge=1, le=GREATEST_ID, description="Length of `retrieval` and `top`; absent: 10 or all.")
 ]
+Brief = Annotated[
+    bool,
+    Query(description="Whether `histogram`, `top`, `retrieval`, `actions` stay empty: a tenth of the bytes."),
+]
 
 # Answers: plain dictionaries, because every answer to a view holds some forty of them
 
@@ -139,8 +143,8 @@ FrameName = Annotated[str | None, Field(description="What the map image is calle
 class HistogramAnswer(TypedDict):
     """The belief in equal bins along the whole route, at most 200 of them whatever the number of map images."""
 
-    edges_m: Annotated[list[float], Field(description="One longer than `mass`.", min_length=2, max_length=201)]
-    mass: Annotated[list[float], Field(description="Sums to 1.", min_length=1, max_length=200)]
+    edges_m: Annotated[list[float], Field(description="One longer than `mass`; none in brief.", max_length=201)]
+    mass: Annotated[list[float], Field(description="Sums to 1; none in brief.", max_length=200)]
 
 
 class PlaceAnswer(TypedDict):
@@ -220,12 +224,12 @@ class LocalizationAnswer(TypedDict):
 
 
 def render_localization(
-    localization: Localization, watch: Stopwatch, remarks: Sequence[str] = ()
+    localization: Localization, watch: Stopwatch, remarks: Sequence[str] = (), brief: bool = False
 ) -> LocalizationAnswer:
     """The answer to one view, with remarks on its picture; the watch runs since the request arrived."""
     snapshot, relevance = localization.snapshot, localization.relevance
     is_confident = localization.belief.near_mode >= DEFAULT_CONFIDENCE
-    return {
+    answer: LocalizationAnswer = {
         "map_version": snapshot.version,
         "belief": render_belief(snapshot, localization.belief, is_confident),
         "informative": localization.is_informative,
@@ -234,6 +238,17 @@ def render_localization(
         "next_best_view": render_plan(localization.plan, snapshot.actions_m, is_confident),
         "timings_ms": watch.timings_ms(),
     }
+    if brief:
+        empty_lists(answer)
+    return answer
+
+
+def empty_lists(answer: Any) -> None:
+    """Empty the long lists of an answer to a view, by which no robot drives."""
+    answer["retrieval"] = answer["belief"]["top"] = []
+    answer["belief"]["histogram"] = {"edges_m": [], "mass": []}
+    if answer["next_best_view"] is not None:
+        answer["next_best_view"]["actions"] = []
 
 
 def render_shortlist(snapshot: Map, ids: NDArray[np.int64], relevance: NDArray[np.float32]) -> list[RetrievedAnswer]:
@@ -347,6 +362,7 @@ async def post_localization(
     domain: DomainName,
     request: Request,
     shortlist: Shortlist = None,
+    brief: Brief = False,
     if_match: LandmarkModelTag = None,
 ) -> Response:
     """Localize one view: an image, whatever image type the header names, or what a robot made of it on board.
@@ -384,7 +400,7 @@ async def post_localization(
         geopose = render_geopose(snapshot, record.options.get("anchor"), int(localization.belief.top[0]))
         return Response(to_json(geopose), media_type=GEOPOSE)
     answer, body = await services.render_json(
-        localization.belief.top.size, render_localization, localization, watch, remarks
+        localization.belief.top.size, render_localization, localization, watch, remarks, brief
     )
     services.metrics.record_localization(domain, answer["timings_ms"], answer["belief"]["entropy_bits"])
     return Response(body, media_type=JSON)

@@ -15,10 +15,12 @@ from deepsimbad.api.localizations import (
     OBSERVATION_BODY,
     OBSERVATION_TYPES,
     BeliefAnswer,
+    Brief,
     NextBestViewAnswer,
     RetrievedAnswer,
     Shortlist,
     Timings,
+    empty_lists,
     npy_response,
     render_belief,
     render_plan,
@@ -221,16 +223,19 @@ def render_session(view: SessionView) -> SessionAnswer:
     }
 
 
-def render_observation(view: SessionView, watch: Stopwatch) -> ObservationAnswer:
+def render_observation(view: SessionView, watch: Stopwatch, brief: bool = False) -> ObservationAnswer:
     """A session after an observation; the watch runs since the request arrived."""
     retrieval = [] if view.relevance is None else render_shortlist(view.snapshot, view.shortlist, view.relevance)
-    return {
+    answer: ObservationAnswer = {
         **render_session(view),
         "informative": view.is_informative,
         "warnings": [*view.remarks, *warnings_of(view.is_informative, view.belief, view.plan)],
         "retrieval": retrieval,
         "timings_ms": watch.timings_ms(),
     }
+    if brief:
+        empty_lists(answer)
+    return answer
 
 
 def render_listed(listed_session: ListedSession) -> ListedSessionAnswer:
@@ -294,6 +299,7 @@ async def post_observation(
         Query(description="How sure that is, a standard deviation; absent: usual odometry; 0: exact."),
     ] = None,
     shortlist: Shortlist = None,
+    brief: Brief = False,
     idempotency_key: Annotated[
         KeyWord | None, idempotency_header("observation again counts once, and has the same answer.")
     ] = None,
@@ -322,7 +328,7 @@ async def post_observation(
         raise
     if media_type in MEDIA_TYPES and await _keeps_pictures(services, view.snapshot.domain):
         services.pictures.hold_view(session_id, body)
-    answer, body = await services.render_json(view.belief.top.size, render_observation, view, watch)
+    answer, body = await services.render_json(view.belief.top.size, render_observation, view, watch, brief)
     domain = request.scope["state"]["domain"] = answer["domain"]
     outcome = "repeated" if view.is_repeated else "accepted"
     services.metrics.record_localization(domain, answer["timings_ms"], answer["belief"]["entropy_bits"], outcome)

@@ -33,6 +33,8 @@ def test_a_session_from_start_to_end(client, views):
         blank = session.observe(dissimilarities=[1] * 50)
         assert not blank.informative
         assert blank.warnings
+        brief = session.observe(encoding=views[68], brief=True)
+        assert (abs(brief.belief.mode_m - 68) <= 2, brief.belief.histogram.mass, brief.retrieval) == (True, (), ())
         observed = session.observe(encoding=views[68])
         masses = session.belief_masses()
         assert (masses.dtype, masses.shape) == (np.float32, (120,))
@@ -42,7 +44,7 @@ def test_a_session_from_start_to_end(client, views):
         carried_state = session.set_prior(20.0, 3.0)
         assert carried_state.belief.mode_m == 20
         with client.attach_session(session.session_id) as attached:
-            assert (attached.opened.belief, attached.opened.n_observations) == (carried_state.belief, 10)
+            assert (attached.opened.belief, attached.opened.n_observations) == (carried_state.belief, 11)
         assert session.state().belief == carried_state.belief, "what was attached lives on"
         with client.attach_session(session.session_id, keep=False):
             pass
