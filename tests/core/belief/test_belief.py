@@ -102,6 +102,14 @@ def test_a_belief_at_a_wrong_place_goes_on_however_surely_views_exclude_it(kind,
     assert belief.doubt.off_route == pytest.approx(1)
 
 
+def test_no_mass_gets_so_small_that_processors_take_it_slowly(route):
+    belief, rule = GridFilter.uniform(route, UpdateRule.LOG_LIKELIHOOD), UpdateRule.LOG_LIKELIHOOD
+    for step in range(10):
+        belief = belief.updated(evidence_of(np.where(np.arange(100) < 50, 0.0, -9.5), rule), step)
+    assert np.unique(belief.masses > 0, return_counts=True)[1].tolist() == [50, 50]
+    assert belief.masses[belief.masses > 0].min() > np.finfo(np.float32).tiny
+
+
 def error_matrix(n, action, std, closed=False, slipping=1.0):
     """[n, n] how the mass of every cell is spread by a move's error, none lost at the ends; all in cells.
 
