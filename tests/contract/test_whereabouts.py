@@ -81,6 +81,14 @@ def test_one_domain_named_answers_as_its_own_call(routes):
     assert (best["probability"], elsewhere_probability) == pytest.approx((probability, 1 - probability))
 
 
+def test_a_brief_answer_of_many_domains_has_no_lists(routes):
+    answer = answer_of(routes, view_of(routes, "a", 12), brief=True)
+    assert [domain["retrieval"] + domain["belief"]["top"] + answer["top"] for domain in answer["domains"]] == [[]] * 3
+    assert (
+        answer["domains"][0]["belief"]["mode_m"] == routes.localize("a", view_of(routes, "a", 12))["belief"]["mode_m"]
+    )
+
+
 def test_probabilities_are_those_of_the_plain_formula_over_each_domain(routes):
     view = view_of(routes, "b", 30)
     log_evidences = {name: answer_of(routes, view, [name])["domains"][0]["log_evidence"] for name in ("a", "b", "far")}

@@ -334,18 +334,21 @@ class ClientCalls(Face, Generic[AnySession]):
         *,
         domains: Sequence[str] | None = None,
         shortlist: int | None = None,
+        brief: bool = False,
         in_full: int | None = None,
         **view: Unpack[ViewForm],
     ) -> Whereabouts:
-        """On which of many domains one view is, and where on them; the forms of a view are those of `localize`.
+        """On which of many domains one view is, and where on them; its forms and `brief` are those of `localize`.
 
         `domains` are asked (absent: all that the key opens), all equally probable beforehand; `in_full` is how many of
         the likeliest are answered with their beliefs. Raises UnknownDomainError, ForbiddenError, InvalidInputError,
         LandmarkModelDiffersError (ranks and dissimilarities are of one landmark model), ConflictError (none answers).
         """
         body = observation(image, **view)
-        params = {"domains": domains, "shortlist": shortlist, "in_full": in_full}
-        return await self._wire.model(Whereabouts, Call("POST", "/v1/localizations", params, body.headers, body.body))
+        wishes = {"shortlist": shortlist, "brief": "true" if brief else None, "in_full": in_full}
+        return await self._wire.model(
+            Whereabouts, Call("POST", "/v1/localizations", {"domains": domains, **wishes}, body.headers, body.body)
+        )
 
     @shared
     async def relevances(

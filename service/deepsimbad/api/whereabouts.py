@@ -15,12 +15,14 @@ from deepsimbad.api.localizations import (
     OBSERVATION_TYPES,
     WARNING_PROBABILITY,
     BeliefAnswer,
+    Brief,
     NextBestViewAnswer,
     ObservationBody,
     PlaceAnswer,
     RetrievedAnswer,
     Shortlist,
     Timings,
+    empty_lists,
     observation_body,
     render_localization,
     view_in,
@@ -138,7 +140,7 @@ class WhereaboutsAnswer(TypedDict):
 
 
 def render_whereabouts(
-    posterior: Whereabouts, watch: Stopwatch, remarks: Sequence[str], n_top: int | None
+    posterior: Whereabouts, watch: Stopwatch, remarks: Sequence[str], n_top: int | None, brief: bool
 ) -> WhereaboutsAnswer:
     """The answer of a posterior over domains; the watch runs since the request arrived."""
     domains, places = list[LikelyDomainAnswer](), list[LikelyPlaceAnswer]()
@@ -159,6 +161,10 @@ def render_whereabouts(
         )
         for place in answer["belief"]["top"]:
             places.append({**place, "domain": name, "mass": probability * place["mass"]})
+    if brief:
+        places = []
+        for domain in domains:
+            empty_lists(domain)
     is_informative = bool(domains) and domains[0]["informative"]
     warnings = [*remarks] + ([] if is_informative else ["the view told nothing of the place"])
     if posterior.elsewhere_probability > WARNING_PROBABILITY:
@@ -197,6 +203,7 @@ async def post_whereabouts(
     services: RunningServices,
     domains: DomainNames = None,
     shortlist: Shortlist = None,
+    brief: Brief = False,
     in_full: InFull = 5,
     if_match: LandmarkModelTag = None,
 ) -> Response:
@@ -245,7 +252,7 @@ async def post_whereabouts(
         raise _no_answer(posterior.left_out)
     likeliest_remarks = remarks[next(iter(posterior.probabilities))]
     _, answer = await services.render_json(
-        in_full * (shortlist or 1), render_whereabouts, posterior, watch, likeliest_remarks, shortlist
+        in_full * (shortlist or 1), render_whereabouts, posterior, watch, likeliest_remarks, shortlist, brief
     )
     return Response(answer, media_type=JSON)
 
