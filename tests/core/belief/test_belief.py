@@ -84,19 +84,21 @@ def test_relevances_of_any_size_leave_a_belief(kind, rule, route):
     assert 0 <= belief.doubt.off_route <= 1
 
 
-def test_a_view_that_excludes_all_that_is_believed_changes_nothing(route):
+@pytest.mark.parametrize("log_likelihood", [-40, -75, -95, -1e5])
+def test_a_view_that_excludes_all_that_is_believed_changes_nothing(log_likelihood, route):
     belief = holding(route, np.eye(100)[3], rule=UpdateRule.LOG_LIKELIHOOD)
-    evidence = evidence_of(-1e5 * np.eye(100)[3], UpdateRule.LOG_LIKELIHOOD)
+    evidence = evidence_of(log_likelihood * np.eye(100)[3], UpdateRule.LOG_LIKELIHOOD)
     np.testing.assert_allclose(belief.updated(evidence, step=0).mass, belief.mass)
 
 
+@pytest.mark.parametrize("log_likelihood", [30.0, 60.0, 95.0, 500.0])
 @pytest.mark.parametrize("kind", list(FilterKind))
-def test_a_belief_at_a_wrong_place_goes_on_however_surely_views_exclude_it(kind, route):
+def test_a_belief_at_a_wrong_place_goes_on_however_surely_views_exclude_it(kind, log_likelihood, route):
     """Nothing is found on the way, so more and more is lost, and rounding alone leaves some on the route."""
     rule = UpdateRule.LOG_LIKELIHOOD
     belief = FILTERS[kind].around(route, 20.0, 2.0, rule=rule)
     for step in range(5):
-        evidence = evidence_of(np.where(np.arange(100) < 80, 0.0, 500.0), rule)
+        evidence = evidence_of(np.where(np.arange(100) < 80, 0.0, log_likelihood), rule)
         belief = belief.updated(evidence, step).predicted(1.0, 0.1, step + 1)
         assert belief.mass.sum() == pytest.approx(1)
     assert belief.doubt.off_route == pytest.approx(1)

@@ -35,7 +35,7 @@ from deepsimbad.core.route import Route
 
 _BLOCK = 1024  # cells whose sums stay in the first-level cache
 _ROUNDED = 1e-6  # of a mass; a difference below it is summed anew, since rounding would be felt
-_NOTHING = 1e-300  # of a mass: a view that leaves no more of a belief excludes it
+_NOTHING = 1e-300  # the least that is divided by
 _LEAST_MASS = np.float32(1e-30)  # a lesser one is 0, before it gets so small that processors take it slowly
 
 
@@ -183,9 +183,9 @@ def _weigh(
         log_trust.copy(),
     )
     for t in range(lost.size):
-        if total[t] <= _NOTHING:
+        if total[t] <= LEAST_ALLOWED * average[t]:
             total[t] = LEAST_ALLOWED * average[t]
-            kept_share[t] = total[t] / max(1.0 - lost[t], _NOTHING)
+            kept_share[t] = total[t] / max(masses[t].sum(dtype=np.float64), _LEAST_MASS)
         explained = total[t] + lost[t] * average[t]
         gain[t] = 1.0 / explained
         lost_after[t] = lost[t] * average[t] * gain[t]
