@@ -50,7 +50,7 @@ class Settings(BaseSettings):
     data_dir: Path = Path("deepsimbad-data")
     """Folder of the catalog, traverses and maps."""
     map_store: Annotated[str | None, Field(min_length=1)] = None
-    """URL of the objects by which machines share maps, as `s3://bucket/prefix`; none: what the data directory had, if any."""
+    """URL of the objects by which machines share maps, as `s3://bucket/prefix`; none: what the data directory had."""
     map_cache_disk_bytes: PositiveInt = 16384 * MEBIBYTE
     """Map files kept that a map store has too, in bytes; those asked for longest ago are removed, unless in use."""
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
